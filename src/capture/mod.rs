@@ -1,0 +1,59 @@
+//! Capture: cameras, real or from files, in; time-stamped stereo pairs out.
+//!
+//! A [`PairSource`] hands out one [`PairEvent`] after the other until its recording ends. What goes
+//! wrong with one pair is an event, not the end of the run.
+
+use crate::image::GrayImage;
+
+/// Which of the two cameras.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub enum Side {
+    /// The left camera, whose frame is the reference.
+    Left,
+    /// The right camera.
+    Right,
+}
+
+/// Two images taken at the same instant, raw: neither undistorted nor rectified.
+#[derive(Clone, Debug)]
+pub struct StereoPair {
+    /// The number of the pair in its recording, counted from 0, unusable pairs included.
+    pub sequence: u64,
+    /// When the left image was taken, ns, in the recording's own clock.
+    pub timestamp_ns: i64,
+    /// The left camera's image.
+    pub left: GrayImage,
+    /// The right camera's image.
+    pub right: GrayImage,
+}
+
+/// Why a pair could not be handed on.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub struct Unusable {
+    /// The number of the pair in its recording.
+    pub sequence: u64,
+    /// When it was taken, ns, where that is known.
+    pub timestamp_ns: Option<i64>,
+    /// One sentence with the file's name and the cause.
+    pub why: String,
+}
+
+/// What a source hands out.
+#[derive(Clone, Debug)]
+pub enum PairEvent {
+    /// A pair, ready for the stages.
+    Pair(StereoPair),
+    /// A pair that had to be skipped, and why.
+    Unusable(Unusable),
+}
+
+/// Something that hands out stereo pairs in order.
+pub trait PairSource: Send {
+    /// The next event; `None` after the last. Blocks until there is one.
+    fn next_event(&mut self) -> Option<PairEvent>;
+
+    /// How many events there will be in all, where that is known.
+    fn len_hint(&self) -> Option<u64> {
+        None
+    }
+}

@@ -1,0 +1,59 @@
+//! The command line: one file a command.
+
+mod rig;
+
+use clap::{Parser, Subcommand};
+use std::process::ExitCode;
+
+/// Stereo visual odometry that knows its own error.
+#[derive(Parser)]
+#[command(version, about, arg_required_else_help = true)]
+struct Cli {
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    Rig(rig::Args),
+}
+
+/// Why a command did not do what it was asked to.
+#[derive(Debug, PartialEq, Eq)]
+pub(crate) enum Failure {
+    /// The command line, a configuration or a rig is wrong: exit code 2.
+    Usage(String),
+    /// Anything else: exit code 1.
+    Other(String),
+}
+
+impl Failure {
+    /// Bad usage or configuration, from anything that explains itself.
+    pub(crate) fn usage(cause: impl std::fmt::Display) -> Self {
+        Self::Usage(cause.to_string())
+    }
+
+    /// Any other failure, from anything that explains itself.
+    pub(crate) fn other(cause: impl std::fmt::Display) -> Self {
+        Self::Other(cause.to_string())
+    }
+}
+
+/// Runs the command line of this process. Exit code: 0 success, 2 bad usage or configuration, 1 any
+/// other failure.
+pub fn main() -> ExitCode {
+    let result = match Cli::parse().command {
+        Command::Rig(args) => rig::run(&args),
+    };
+    match result {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(Failure::Usage(cause)) => {
+            eprintln!("visod: {cause}");
+            ExitCode::from(2)
+        }
+        Err(Failure::Other(cause)) => {
+            eprintln!("visod: {cause}");
+            ExitCode::FAILURE
+        }
+    }
+}

@@ -1,0 +1,1 @@
+//! Configuration: what was typed in, a checked one out.

@@ -1,0 +1,89 @@
+//! Estimation: matched features in, motion and pose with covariance out.
+
+use nalgebra::{Isometry3, Matrix6, Vector6};
+
+/// How far an estimate can be trusted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Serialize, serde::Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Status {
+    /// The first pair of an epoch: a pose by definition, no motion yet.
+    Initializing,
+    /// The motion was measured.
+    Tracking,
+    /// The motion was measured, from fewer or worse features than it should be.
+    Degraded,
+    /// The motion was not measured: the pose is bridged by the last velocity.
+    Lost,
+}
+
+impl Status {
+    /// The word used in CSV, JSON and logs.
+    #[must_use]
+    pub fn as_str(self) -> &'static str {
+        match self {
+            Self::Initializing => "initializing",
+            Self::Tracking => "tracking",
+            Self::Degraded => "degraded",
+            Self::Lost => "lost",
+        }
+    }
+}
+
+/// How many of what one pair had.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Counts {
+    /// Keypoints of the left image.
+    pub keypoints_left: u32,
+    /// Keypoints of the right image.
+    pub keypoints_right: u32,
+    /// Left–right matches.
+    pub stereo_matches: u32,
+    /// Stereo matches found again from the pair before.
+    pub tracks: u32,
+    /// Tracks that the estimate rests on.
+    pub inliers: u32,
+}
+
+/// The published covariance by source; the parts sum to the whole.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct ErrorBudget {
+    /// From the detection of keypoints.
+    pub detection: Matrix6<f64>,
+    /// From motions that had to be bridged because they could not be measured.
+    pub bridging: Matrix6<f64>,
+}
+
+/// Pose, motion and velocity after one stereo pair, each with its covariance.
+///
+/// Covariances are ordered x, y, z, rx, ry, rz (m², m·rad, rad²). Those of `odom_from_camera` and
+/// `prev_from_now` hold the error `[t_est − t ; Log(R_est Rᵀ)]`: translation in, and rotation about
+/// the fixed axes of, the frame named first. The twist's is in the camera frame.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Odometry {
+    /// The number of the pair in its recording.
+    pub sequence: u64,
+    /// When the left image was taken, ns.
+    pub timestamp_ns: i64,
+    /// Rises whenever the odometry frame begins anew.
+    pub epoch: u32,
+    /// How far this estimate can be trusted.
+    pub status: Status,
+    /// Pose: maps a point of the left camera now into the odometry frame, m.
+    pub odom_from_camera: Isometry3<f64>,
+    /// Covariance of the pose.
+    pub cov_pose: Matrix6<f64>,
+    /// Motion since the pair before: maps a point of the left camera now into the left camera then.
+    pub prev_from_now: Isometry3<f64>,
+    /// Covariance of the motion.
+    pub cov_motion: Matrix6<f64>,
+    /// Velocity in the camera frame: m/s then rad/s.
+    pub twist: Vector6<f64>,
+    /// Covariance of the velocity.
+    pub cov_twist: Matrix6<f64>,
+    /// The pose's covariance by source.
+    pub budget: ErrorBudget,
+    /// What the estimate rests on.
+    pub counts: Counts,
+    /// A-posteriori variance factor: 1 when residuals are as large as the noise model says.
+    pub variance_factor: f64,
+}

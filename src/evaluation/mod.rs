@@ -1,0 +1,1 @@
+//! Evaluation: an estimate and the truth in, errors and consistency out.

@@ -1,0 +1,58 @@
+//! Features: one raw image in, its keypoints with descriptors out.
+//!
+//! Positions are raw image pixels (distorted, unrectified), pixel centres at integers.
+
+/// One distinctive point of an image.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Keypoint {
+    /// Column of the centre, px.
+    pub x_px: f32,
+    /// Row of the centre, px.
+    pub y_px: f32,
+    /// Diameter of the meaningful neighbourhood, px (SURF: 9 px at scale 1.2).
+    pub size_px: f32,
+    /// Dominant direction, rad in [0, 2π), from the x axis towards the y axis (down).
+    pub angle_rad: f32,
+    /// Strength of the detector's answer (SURF: determinant of the Hessian).
+    pub response: f32,
+    /// Octave in which it was found, counted from 0.
+    pub octave: i32,
+    /// Sign of the Laplacian: +1 a dark blob on light ground, −1 the other way, 0 unknown.
+    pub laplacian: i8,
+    /// Standard deviation of the position in x and y, px, before the run's own variance factor.
+    pub sigma_px: f32,
+}
+
+/// The features of one image: keypoint `i` has descriptor `i`.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Features {
+    /// The keypoints.
+    pub keypoints: Vec<Keypoint>,
+    /// How many floats a descriptor has.
+    pub descriptor_len: usize,
+    /// All descriptors, one after the other, each of unit length.
+    pub descriptors: Vec<f32>,
+}
+
+impl Features {
+    /// The number of keypoints.
+    #[must_use]
+    pub fn len(&self) -> usize {
+        self.keypoints.len()
+    }
+
+    /// Whether there are none.
+    #[must_use]
+    pub fn is_empty(&self) -> bool {
+        self.keypoints.is_empty()
+    }
+
+    /// The descriptor of keypoint `index`.
+    ///
+    /// # Panics
+    /// If there is no such keypoint, as a slice index does.
+    #[must_use]
+    pub fn descriptor(&self, index: usize) -> &[f32] {
+        &self.descriptors[index * self.descriptor_len..][..self.descriptor_len]
+    }
+}

@@ -1,0 +1,376 @@
+//! `rig.toml`: a rig as a file, read with every value checked, and written.
+
+use super::{Camera, Distortion, RigUncertainty, StereoRig, so3};
+use crate::toml_file::{TomlError, TomlText};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
+use serde::{Deserialize, Serialize};
+use std::path::Path;
+
+/// Why a rig file cannot be used.
+pub type RigFileError = TomlError;
+
+#[derive(Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+struct RigFile {
+    left: CameraTable,
+    right: CameraTable,
+    right_from_left: ExtrinsicsTable,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    mounting: Option<MountingTable>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    uncertainty: Option<UncertaintyTable>,
+}
+
+#[derive(Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+struct CameraTable {
+    width: u32,
+    height: u32,
+    focal: [f64; 2],
+    principal_point: [f64; 2],
+    #[serde(default)]
+    distortion: DistortionTable,
+}
+
+#[derive(Deserialize, Serialize, Default)]
+#[serde(deny_unknown_fields)]
+struct DistortionTable {
+    model: DistortionModel,
+    #[serde(default)]
+    coefficients: Vec<f64>,
+}
+
+#[derive(Deserialize, Serialize, Default, Clone, Copy, PartialEq)]
+#[serde(rename_all = "lowercase")]
+enum DistortionModel {
+    #[default]
+    None,
+    Radtan,
+    Equidistant,
+}
+
+#[derive(Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+struct ExtrinsicsTable {
+    translation_m: [f64; 3],
+    rotation_vector_rad: [f64; 3],
+}
+
+#[derive(Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+struct MountingTable {
+    translation_m: [f64; 3],
+    rotation_rpy_rad: [f64; 3],
+}
+
+#[derive(Deserialize, Serialize)]
+#[serde(deny_unknown_fields)]
+struct UncertaintyTable {
+    focal_px: f64,
+    principal_point_px: f64,
+    rotation_rad: f64,
+    translation_m: f64,
+}
+
+/// Longest image side that a rig may have, px.
+const MAX_SIDE_PX: u32 = 16_384;
+
+/// Reads a rig file.
+///
+/// # Errors
+/// The file cannot be read, is not TOML, has an unknown or missing key, or a value that no rig can
+/// have; with the line and the key where there is one.
+pub fn load_rig(path: &Path) -> Result<StereoRig, RigFileError> {
+    checked(&TomlText::read(path)?)
+}
+
+/// Reads a rig from a text.
+///
+/// # Errors
+/// As [`load_rig`].
+pub fn parse_rig(text: &str) -> Result<StereoRig, RigFileError> {
+    checked(&TomlText::new("rig", text))
+}
+
+fn checked(text: &TomlText) -> Result<StereoRig, RigFileError> {
+    let file: RigFile = text.parse()?;
+    let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
+        Some(bad) => Err(text.wrong(key, format!("must be finite, but holds {bad}"))),
+        None => Ok(()),
+    };
+
+    let extrinsics = &file.right_from_left;
+    finite("right_from_left.translation_m", &extrinsics.translation_m)?;
+    finite(
+        "right_from_left.rotation_vector_rad",
+        &extrinsics.rotation_vector_rad,
+    )?;
+    let translation = Vector3::from(extrinsics.translation_m);
+    if translation.norm() < 1e-6 {
+        return Err(text.wrong(
+            "right_from_left.translation_m",
+            "the cameras must stand apart, but the baseline is zero",
+        ));
+    }
+
+    let base_from_camera = match &file.mounting {
+        None => None,
+        Some(mounting) => {
+            finite("mounting.translation_m", &mounting.translation_m)?;
+            finite("mounting.rotation_rpy_rad", &mounting.rotation_rpy_rad)?;
+            let [roll, pitch, yaw] = mounting.rotation_rpy_rad;
+            Some(Isometry3::from_parts(
+                Translation3::from(Vector3::from(mounting.translation_m)),
+                UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+            ))
+        }
+    };
+
+    let uncertainty = match &file.uncertainty {
+        None => None,
+        Some(u) => {
+            for (key, sigma) in [
+                ("uncertainty.focal_px", u.focal_px),
+                ("uncertainty.principal_point_px", u.principal_point_px),
+                ("uncertainty.rotation_rad", u.rotation_rad),
+                ("uncertainty.translation_m", u.translation_m),
+            ] {
+                if !(sigma.is_finite() && sigma >= 0.0) {
+                    return Err(text.wrong(
+                        key,
+                        format!(
+                            "a standard deviation must be finite and not negative, but is {sigma}"
+                        ),
+                    ));
+                }
+            }
+            Some(RigUncertainty {
+                focal_px: u.focal_px,
+                principal_point_px: u.principal_point_px,
+                rotation_rad: u.rotation_rad,
+                translation_m: u.translation_m,
+            })
+        }
+    };
+
+    Ok(StereoRig {
+        left: camera(text, "left", &file.left)?,
+        right: camera(text, "right", &file.right)?,
+        right_from_left: Isometry3::from_parts(
+            Translation3::from(translation),
+            so3::exp(&Vector3::from(extrinsics.rotation_vector_rad)),
+        ),
+        base_from_camera,
+        uncertainty,
+    })
+}
+
+fn camera(text: &TomlText, side: &str, table: &CameraTable) -> Result<Camera, RigFileError> {
+    let key = |name: &str| format!("{side}.{name}");
+    for (name, value) in [("width", table.width), ("height", table.height)] {
+        if !(1..=MAX_SIDE_PX).contains(&value) {
+            return Err(text.wrong(
+                &key(name),
+                format!("must be from 1 to {MAX_SIDE_PX} px, but is {value}"),
+            ));
+        }
+    }
+    if let Some(bad) = table.focal.iter().find(|f| !(f.is_finite() && **f > 0.0)) {
+        return Err(text.wrong(
+            &key("focal"),
+            format!("must be finite and above 0 px, but holds {bad}"),
+        ));
+    }
+    if let Some(bad) = table.principal_point.iter().find(|c| !c.is_finite()) {
+        return Err(text.wrong(
+            &key("principal_point"),
+            format!("must be finite, but holds {bad}"),
+        ));
+    }
+    let coefficients = &table.distortion.coefficients;
+    if let Some(bad) = coefficients.iter().find(|c| !c.is_finite()) {
+        return Err(text.wrong(
+            &key("distortion"),
+            format!("coefficients must be finite, but hold {bad}"),
+        ));
+    }
+    let count = coefficients.len();
+    let distortion = match table.distortion.model {
+        DistortionModel::None if count == 0 => Distortion::None,
+        DistortionModel::Radtan if matches!(count, 4 | 5 | 8) => {
+            let mut k = [0.0; 8];
+            k[..count].copy_from_slice(coefficients);
+            Distortion::Radtan(k)
+        }
+        DistortionModel::Equidistant if count == 4 => Distortion::Equidistant([
+            coefficients[0],
+            coefficients[1],
+            coefficients[2],
+            coefficients[3],
+        ]),
+        model => {
+            let wants = match model {
+                DistortionModel::None => "model \"none\" takes no coefficients",
+                DistortionModel::Radtan => "model \"radtan\" takes 4, 5 or 8 coefficients",
+                DistortionModel::Equidistant => "model \"equidistant\" takes 4 coefficients",
+            };
+            return Err(text.wrong(&key("distortion"), format!("{wants}, but has {count}")));
+        }
+    };
+    Ok(Camera::new(
+        table.width,
+        table.height,
+        Vector2::from(table.focal),
+        Vector2::from(table.principal_point),
+        distortion,
+    ))
+}
+
+/// A rig as the text of a rig file; [`parse_rig`] reads it back to the last bit but for the
+/// rotations, which differ by rounding.
+#[must_use]
+pub fn rig_to_toml(rig: &StereoRig) -> String {
+    let file = RigFile {
+        left: camera_table(&rig.left),
+        right: camera_table(&rig.right),
+        right_from_left: ExtrinsicsTable {
+            translation_m: rig.right_from_left.translation.vector.into(),
+            rotation_vector_rad: so3::log(&rig.right_from_left.rotation).into(),
+        },
+        mounting: rig.base_from_camera.as_ref().map(|base_from_camera| {
+            let (roll, pitch, yaw) = base_from_camera.rotation.euler_angles();
+            MountingTable {
+                translation_m: base_from_camera.translation.vector.into(),
+                rotation_rpy_rad: [roll, pitch, yaw],
+            }
+        }),
+        uncertainty: rig.uncertainty.map(|u| UncertaintyTable {
+            focal_px: u.focal_px,
+            principal_point_px: u.principal_point_px,
+            rotation_rad: u.rotation_rad,
+            translation_m: u.translation_m,
+        }),
+    };
+    // A tree of numbers and short strings always has a TOML form.
+    toml::to_string(&file).unwrap_or_default()
+}
+
+fn camera_table(camera: &Camera) -> CameraTable {
+    let (model, coefficients) = match camera.distortion() {
+        Distortion::None => (DistortionModel::None, vec![]),
+        Distortion::Radtan(k) if k[5..].iter().all(|&c| c == 0.0) => {
+            (DistortionModel::Radtan, k[..5].to_vec())
+        }
+        Distortion::Radtan(k) => (DistortionModel::Radtan, k.to_vec()),
+        Distortion::Equidistant(k) => (DistortionModel::Equidistant, k.to_vec()),
+    };
+    CameraTable {
+        width: camera.width,
+        height: camera.height,
+        focal: camera.focal_px.into(),
+        principal_point: camera.principal_point_px.into(),
+        distortion: DistortionTable {
+            model,
+            coefficients,
+        },
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const GOOD: &str = r#"
+[left]
+width = 640
+height = 480
+focal = [885.8, 884.1]
+principal_point = [313.2, 243.5]
+
+[right]
+width = 640
+height = 480
+focal = [882.9, 881.2]
+principal_point = [300.2, 246.4]
+distortion = { model = "radtan", coefficients = [-0.2, 0.1, 0.0, 0.0] }
+
+[right_from_left]
+translation_m = [-0.3857, -0.0072, 0.0001]
+rotation_vector_rad = [0.04046, 0.01616, 0.01419]
+
+[mounting]
+translation_m = [0.4, 0.19, 0.8]
+rotation_rpy_rad = [-1.5707963, 0.0, -1.5707963]
+
+[uncertainty]
+focal_px = 0.5
+principal_point_px = 0.5
+rotation_rad = 1e-4
+translation_m = 2e-4
+"#;
+
+    fn error_of(from: &str, to: &str) -> String {
+        assert!(GOOD.contains(from), "the test's own replacement must apply");
+        parse_rig(&GOOD.replacen(from, to, 1))
+            .expect_err("must be refused")
+            .to_string()
+    }
+
+    #[test]
+    fn a_written_rig_reads_back_the_same() {
+        let rig = parse_rig(GOOD).expect("valid");
+        let again = parse_rig(&rig_to_toml(&rig)).expect("what is written is valid");
+        assert_eq!(rig.left, again.left);
+        assert_eq!(rig.right, again.right);
+        assert_eq!(rig.uncertainty, again.uncertainty);
+        let apart = |a: &Isometry3<f64>, b: &Isometry3<f64>| (a.to_matrix() - b.to_matrix()).norm();
+        assert!(apart(&rig.right_from_left, &again.right_from_left) < 1e-15);
+        let mounting = |rig: &StereoRig| rig.base_from_camera.expect("stated");
+        assert!(apart(&mounting(&rig), &mounting(&again)) < 1e-15);
+    }
+
+    #[test]
+    fn the_mounting_turns_optical_axes_into_the_robots() {
+        let rig = parse_rig(GOOD).expect("valid");
+        let base_from_camera = rig.base_from_camera.expect("stated");
+        let forward = base_from_camera.rotation * Vector3::z();
+        let left = base_from_camera.rotation * -Vector3::x();
+        assert!((forward - Vector3::x()).norm() < 1e-7);
+        assert!((left - Vector3::y()).norm() < 1e-7);
+    }
+
+    #[test]
+    fn mistakes_are_named_with_line_and_key() {
+        assert_eq!(
+            error_of("focal = [885.8,", "focal = [nan,"),
+            "rig:5: left.focal: must be finite and above 0 px, but holds NaN"
+        );
+        assert_eq!(
+            error_of("[-0.3857,", "[inf,"),
+            "rig:16: right_from_left.translation_m: must be finite, but holds inf"
+        );
+        let unknown = error_of("[mounting]", "[mountain]");
+        assert!(
+            unknown.starts_with("rig:19: mountain: unknown field"),
+            "{unknown}"
+        );
+        let wrong_type = error_of("width = 640", "width = \"wide\"");
+        assert!(
+            wrong_type.starts_with("rig:3: left.width: invalid type"),
+            "{wrong_type}"
+        );
+        let syntax = error_of("height = 480", "height 480");
+        assert!(syntax.starts_with("rig:4"), "{syntax}");
+        assert!(!syntax.contains('\n'), "{syntax}");
+        let count = error_of("[-0.2, 0.1, 0.0, 0.0]", "[-0.2, 0.1]");
+        assert!(
+            count.ends_with("takes 4, 5 or 8 coefficients, but has 2"),
+            "{count}"
+        );
+        let missing = error_of("translation_m = [-0.3857, -0.0072, 0.0001]\n", "");
+        assert!(
+            missing.contains("missing field `translation_m`"),
+            "{missing}"
+        );
+    }
+}

@@ -1,0 +1,140 @@
+//! Rigid motions: exponential, logarithm and adjoint, with twists ordered translation, rotation.
+//!
+//! Formulas as in Barfoot, *State Estimation for Robotics*, chapter 7.
+
+use super::so3;
+use nalgebra::{Isometry3, Matrix3, Matrix6, Translation3, Vector3, Vector6};
+
+/// The translation part of a twist.
+#[must_use]
+pub fn translation_of(xi: &Vector6<f64>) -> Vector3<f64> {
+    xi.fixed_rows::<3>(0).into_owned()
+}
+
+/// The rotation part of a twist.
+#[must_use]
+pub fn rotation_of(xi: &Vector6<f64>) -> Vector3<f64> {
+    xi.fixed_rows::<3>(3).into_owned()
+}
+
+/// A twist from its translation and rotation parts.
+#[must_use]
+pub fn twist(translation: &Vector3<f64>, rotation: &Vector3<f64>) -> Vector6<f64> {
+    let mut xi = Vector6::zeros();
+    xi.fixed_rows_mut::<3>(0).copy_from(translation);
+    xi.fixed_rows_mut::<3>(3).copy_from(rotation);
+    xi
+}
+
+/// The motion along the twist `xi` (m, rad).
+#[must_use]
+pub fn exp(xi: &Vector6<f64>) -> Isometry3<f64> {
+    let phi = rotation_of(xi);
+    Isometry3::from_parts(
+        Translation3::from(so3::left_jacobian(&phi) * translation_of(xi)),
+        so3::exp(&phi),
+    )
+}
+
+/// The twist (m, rad) whose motion is `a_from_b`.
+#[must_use]
+pub fn log(a_from_b: &Isometry3<f64>) -> Vector6<f64> {
+    let phi = so3::log(&a_from_b.rotation);
+    twist(
+        &(so3::left_jacobian_inverse(&phi) * a_from_b.translation.vector),
+        &phi,
+    )
+}
+
+/// The adjoint: `a_from_b · exp(xi) = exp(adjoint(a_from_b) · xi) · a_from_b`.
+#[must_use]
+pub fn adjoint(a_from_b: &Isometry3<f64>) -> Matrix6<f64> {
+    let rotation = a_from_b.rotation.to_rotation_matrix();
+    let r = rotation.matrix();
+    let mut ad = Matrix6::zeros();
+    ad.fixed_view_mut::<3, 3>(0, 0).copy_from(r);
+    ad.fixed_view_mut::<3, 3>(3, 3).copy_from(r);
+    ad.fixed_view_mut::<3, 3>(0, 3)
+        .copy_from(&(so3::hat(&a_from_b.translation.vector) * r));
+    ad
+}
+
+/// Turns the covariance of a right perturbation, `T_est = T · exp(ξ)`, into that of the error
+/// `[t_est − t ; Log(R_est Rᵀ)]` about the fixed axes of the frame that `T` maps into.
+#[must_use]
+pub fn cov_fixed_axes_from_right(a_from_b: &Isometry3<f64>, cov: &Matrix6<f64>) -> Matrix6<f64> {
+    let rotate = block_rotation(a_from_b);
+    symmetric(&(rotate * cov * rotate.transpose()))
+}
+
+/// The inverse of [`cov_fixed_axes_from_right`].
+#[must_use]
+pub fn cov_right_from_fixed_axes(a_from_b: &Isometry3<f64>, cov: &Matrix6<f64>) -> Matrix6<f64> {
+    let rotate = block_rotation(a_from_b);
+    symmetric(&(rotate.transpose() * cov * rotate))
+}
+
+/// The error `[t_est − t ; Log(R_est Rᵀ)]` of an estimate, to which fixed-axes covariances belong.
+#[must_use]
+pub fn error_fixed_axes(estimate: &Isometry3<f64>, truth: &Isometry3<f64>) -> Vector6<f64> {
+    twist(
+        &(estimate.translation.vector - truth.translation.vector),
+        &so3::log(&(estimate.rotation * truth.rotation.inverse())),
+    )
+}
+
+/// The mean of a matrix and its transpose: takes out what rounding broke.
+#[must_use]
+pub fn symmetric(m: &Matrix6<f64>) -> Matrix6<f64> {
+    (m + m.transpose()) * 0.5
+}
+
+fn block_rotation(a_from_b: &Isometry3<f64>) -> Matrix6<f64> {
+    let rotation = a_from_b.rotation.to_rotation_matrix();
+    let r: &Matrix3<f64> = rotation.matrix();
+    let mut block = Matrix6::zeros();
+    block.fixed_view_mut::<3, 3>(0, 0).copy_from(r);
+    block.fixed_view_mut::<3, 3>(3, 3).copy_from(r);
+    block
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn any_twist() -> impl Strategy<Value = Vector6<f64>> {
+        (prop::array::uniform6(-1.0..1.0_f64), -8.0..0.2_f64)
+            .prop_map(|(v, exponent)| Vector6::from(v) * 10_f64.powf(exponent))
+    }
+
+    proptest! {
+        #[test]
+        fn log_undoes_exp(xi in any_twist()) {
+            prop_assert!((log(&exp(&xi)) - xi).norm() <= 1e-14 * xi.norm().max(1.0));
+        }
+
+        #[test]
+        fn adjoint_moves_a_perturbation_to_the_other_side(a in any_twist(), b in any_twist()) {
+            let t = exp(&a);
+            let left = t * exp(&b);
+            let right = exp(&(adjoint(&t) * b)) * t;
+            prop_assert!((left.to_matrix() - right.to_matrix()).norm() < 1e-13 * (1.0 + b.norm()).powi(3));
+        }
+
+        #[test]
+        fn exp_of_a_sum_along_one_twist_is_the_product(xi in any_twist(), s in 0.0..1.0_f64) {
+            let product = exp(&(xi * s)) * exp(&(xi * (1.0 - s)));
+            prop_assert!((product.to_matrix() - exp(&xi).to_matrix()).norm() < 1e-13);
+        }
+
+        #[test]
+        fn fixed_axes_error_is_the_rotated_right_perturbation(a in any_twist(), d in any_twist()) {
+            let truth = exp(&a);
+            let small = d * (1e-6 / d.norm().max(1e-9));
+            let error = error_fixed_axes(&(truth * exp(&small)), &truth);
+            let predicted = block_rotation(&truth) * small;
+            prop_assert!((error - predicted).norm() < 1e-11);
+        }
+    }
+}

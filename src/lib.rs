@@ -1,0 +1,35 @@
+//! Stereo visual odometry that knows its own error.
+//!
+//! The modules, in the order in which a stereo pair flows through them:
+//!
+//! | stage | from | to |
+//! |---|---|---|
+//! | [`capture`] | cameras, recordings | [`capture::StereoPair`] |
+//! | [`features`] | one image | [`features::Features`] |
+//! | [`matching`] | features left, right, before | matches, tracks |
+//! | [`estimation`] | tracks | [`estimation::Odometry`] |
+//! | [`output`] | odometry | shared memory, CSV, report |
+//!
+//! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
+//! [`pipeline`] (threads), [`config`] and `cli`. Beside them stand [`simulation`], which renders
+//! recordings with known truth, and [`evaluation`], which compares an estimate with it.
+
+pub mod capture;
+pub mod config;
+pub mod estimation;
+pub mod evaluation;
+pub mod features;
+pub mod geometry;
+pub mod image;
+pub mod matching;
+pub mod output;
+pub mod pipeline;
+pub mod settings;
+pub mod simulation;
+mod toml_file;
+pub mod uncertainty;
+
+pub use toml_file::TomlError;
+
+#[doc(hidden)]
+pub mod cli;

@@ -1,0 +1,5 @@
+//! The `visod` command.
+
+fn main() -> std::process::ExitCode {
+    visod::cli::main()
+}

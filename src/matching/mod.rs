@@ -1,0 +1,1 @@
+//! Matching: features in, left–right matches and tracks over time out.

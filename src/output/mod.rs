@@ -1,0 +1,1 @@
+//! Output: odometry in, shared memory, files and reports out.

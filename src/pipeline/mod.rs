@@ -1,0 +1,1 @@
+//! Pipeline: the threads that carry a pair from capture to output.

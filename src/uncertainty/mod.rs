@@ -1,0 +1,1 @@
+//! Uncertainty: how an error travels, and how to tell whether a covariance holds.
