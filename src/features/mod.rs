@@ -2,6 +2,8 @@
 //!
 //! Positions are raw image pixels (distorted, unrectified), pixel centres at integers.
 
+use crate::image::GrayImage;
+
 /// One distinctive point of an image.
 #[derive(Clone, Copy, Debug, Default, PartialEq)]
 pub struct Keypoint {
@@ -55,4 +57,27 @@ impl Features {
     pub fn descriptor(&self, index: usize) -> &[f32] {
         &self.descriptors[index * self.descriptor_len..][..self.descriptor_len]
     }
+}
+
+/// Something that finds and describes features: SURF, or one of OpenCV's.
+pub trait Extractor: Send {
+    /// Finds and describes the features of `image`, replacing what `features` held and re-using its
+    /// memory. The same image gives the same bits, whoever calls and in whatever order.
+    ///
+    /// # Errors
+    /// The detector could not do its job; a featureless image is no error.
+    fn extract(&mut self, image: &GrayImage, features: &mut Features) -> Result<(), ExtractError>;
+}
+
+/// Why a detector could not do its job.
+#[derive(Debug, Clone, PartialEq, Eq, thiserror::Error)]
+pub enum ExtractError {
+    /// A library that the detector rests on failed.
+    #[error("feature detection with {detector} failed: {cause}")]
+    Library {
+        /// The detector's name.
+        detector: &'static str,
+        /// What the library said.
+        cause: String,
+    },
 }
