@@ -1,5 +1,20 @@
 //! Estimation: matched features in, motion and pose with covariance out.
 
+pub mod bundle;
+pub mod closed_form;
+pub mod consensus;
+mod motion;
+mod odometer;
+mod settings;
+mod sight;
+mod triangulation;
+
+pub use motion::{MeasuredMotion, measure};
+pub use odometer::{Odometer, PairStamp};
+pub use settings::{Method, Settings};
+pub use sight::{inverse_depth, seen_at};
+pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
+
 use nalgebra::{Isometry3, Matrix6, Vector6};
 
 /// How far an estimate can be trusted.

@@ -1,1 +1,5 @@
-//! Pipeline: the threads that carry a pair from capture to output.
+//! Pipeline: the method itself, and the threads that carry pairs through it.
+
+mod method;
+
+pub use method::{DescribedPair, Method, StageTimes};

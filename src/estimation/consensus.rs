@@ -1,0 +1,286 @@
+//! Consensus: tracks in, a motion that most of them share out, and which ones.
+//!
+//! RANSAC over samples of three points: closed form on the triangulated points, then a few steps on
+//! the sample's reprojection, for depth noise makes the closed form coarse. Tracks are judged in
+//! the image, in units of the σ that is predicted for each (theory: a gate in 3D would truncate the
+//! error's distribution and spoil the covariance).
+
+use super::bundle::TrackedPoint;
+use super::{closed_form, sight};
+use crate::geometry::{StereoRig, se3};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix6, Point3, Vector3, Vector4, Vector6};
+use rand::{RngExt, SeedableRng};
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+/// How a consensus is sought.
+#[derive(Clone, Copy, Debug)]
+pub struct Search {
+    /// Samples at most.
+    pub max_samples: u32,
+    /// Squared distance, in σ², up to which a track agrees with a motion (χ², four degrees of
+    /// freedom), for a variance factor of 1.
+    pub gate: f64,
+    /// The variance factor that is expected.
+    pub variance_factor: f64,
+    /// Seed of the samples.
+    pub seed: u64,
+}
+
+/// A motion and the tracks that agree with it.
+#[derive(Clone, Debug)]
+pub struct Consensus {
+    /// Maps a point of the left camera now into the left camera before.
+    pub prev_from_now: Isometry3<f64>,
+    /// Indices of the tracks that agree, ascending.
+    pub inliers: Vec<u32>,
+}
+
+/// The probability, at most, that no sample was free of outliers.
+const MISS_PROBABILITY: f64 = 1e-4;
+/// Samples drawn even where the first ones agree with everything.
+const MIN_SAMPLES: u32 = 12;
+/// A sample's motion has errors of its own: its gate is wider by this factor in σ².
+const SAMPLE_SLACK: f64 = 4.0;
+/// Gauss–Newton steps on a sample, and on all inliers of the best one.
+const SAMPLE_STEPS: usize = 3;
+const FINAL_ROUNDS: usize = 3;
+
+/// Finds the consensus of `points`. `guess`, where there is one, is tried before any sample.
+///
+/// `None` if fewer than three tracks agree on anything.
+#[must_use]
+pub fn find(
+    rig: &StereoRig,
+    points: &[TrackedPoint],
+    guess: Option<&Isometry3<f64>>,
+    search: &Search,
+) -> Option<Consensus> {
+    let candidates: Vec<Candidate> = points
+        .iter()
+        .map(|p| Candidate::new(rig, p, guess))
+        .collect();
+    let gate = search.gate * search.variance_factor;
+    let mut best = Best::default();
+    if let Some(guess) = guess {
+        let refined = refine_on_agreeing(rig, &candidates, guess, gate * SAMPLE_SLACK);
+        best.offer(
+            rig,
+            &candidates,
+            &refined.unwrap_or(*guess),
+            gate * SAMPLE_SLACK,
+        );
+    }
+    let samplable: Vec<usize> = (0..candidates.len())
+        .filter(|&i| candidates[i].euclidean.is_some())
+        .collect();
+    if samplable.len() >= 3 {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(search.seed);
+        let mut drawn = 0;
+        while drawn
+            < search
+                .max_samples
+                .min(best.samples_needed(candidates.len()))
+        {
+            drawn += 1;
+            let sample = draw_three(&mut rng, &samplable);
+            if let Some(motion) = motion_of_sample(rig, &candidates, &sample) {
+                best.offer(rig, &candidates, &motion, gate * SAMPLE_SLACK);
+            }
+        }
+    }
+    let mut motion = best.motion?;
+    for round in 0..FINAL_ROUNDS {
+        let slack = if round + 1 < FINAL_ROUNDS {
+            SAMPLE_SLACK
+        } else {
+            1.0
+        };
+        if let Some(refined) = refine_on_agreeing(rig, &candidates, &motion, gate * slack) {
+            motion = refined;
+        }
+    }
+    let inliers: Vec<u32> = (0..candidates.len() as u32)
+        .filter(|&i| candidates[i as usize].squared_sigmas(rig, &motion) <= gate)
+        .collect();
+    (inliers.len() >= 3).then_some(Consensus {
+        prev_from_now: motion,
+        inliers,
+    })
+}
+
+/// A track prepared for being judged many times.
+struct Candidate {
+    now_px: Vector4<f64>,
+    /// (x, y, ρ) of the earlier measurement alone.
+    inverse_depth: Vector3<f64>,
+    /// Both triangulated points, where both are in front and near enough to have a depth.
+    euclidean: Option<(Point3<f64>, Point3<f64>)>,
+    /// Inverse of the covariance predicted for the residual of the present measurement.
+    info: Matrix4<f64>,
+}
+
+impl Candidate {
+    fn new(rig: &StereoRig, p: &TrackedPoint, guess: Option<&Isometry3<f64>>) -> Self {
+        let now_from_prev = guess.map_or_else(Isometry3::identity, Isometry3::inverse);
+        let info = Self::predicted_info(rig, p, &now_from_prev).unwrap_or_else(|| {
+            let var = p.now.sigma_px.component_mul(&p.now.sigma_px) * 4.0;
+            Matrix4::from_diagonal(&var.map(|v| 1.0 / v))
+        });
+        let euclidean = super::triangulate(rig, &p.now).and_then(|now| {
+            let y = p.inverse_depth;
+            let far = y.z < 1e-4 || !now.point.z.is_finite();
+            (!far).then(|| (Point3::from(Vector3::new(y.x, y.y, 1.0) / y.z), now.point))
+        });
+        Self {
+            now_px: p.now.px,
+            inverse_depth: p.inverse_depth,
+            euclidean,
+            info,
+        }
+    }
+
+    /// Residual now = its own noise plus what the earlier measurement's point carries over.
+    fn predicted_info(
+        rig: &StereoRig,
+        p: &TrackedPoint,
+        now_from_prev: &Isometry3<f64>,
+    ) -> Option<Matrix4<f64>> {
+        let identity = Isometry3::identity();
+        let prev_by_point = sight::linearise(rig, &identity, &p.inverse_depth)?.by_point;
+        let prev_info = p.prev.sigma_px.map(|s| 1.0 / (s * s));
+        let hessian =
+            prev_by_point.transpose() * Matrix4::from_diagonal(&prev_info) * prev_by_point;
+        let cov_point: Matrix3<f64> = hessian.cholesky()?.inverse();
+        let now_by_point = sight::linearise(rig, now_from_prev, &p.inverse_depth)?.by_point;
+        let cov = p.now.cov_px2() + now_by_point * cov_point * now_by_point.transpose();
+        Some(cov.cholesky()?.inverse())
+    }
+
+    /// Squared Mahalanobis distance of the present measurement from what a motion predicts.
+    fn squared_sigmas(&self, rig: &StereoRig, prev_from_now: &Isometry3<f64>) -> f64 {
+        let now_from_prev = prev_from_now.inverse();
+        let Some(seen) = sight::seen_at(rig, &now_from_prev, &self.inverse_depth) else {
+            return f64::INFINITY;
+        };
+        let e = self.now_px - seen;
+        e.dot(&(self.info * e))
+    }
+}
+
+fn draw_three(rng: &mut Xoshiro256PlusPlus, among: &[usize]) -> [usize; 3] {
+    let n = among.len();
+    let a = rng.random_range(0..n);
+    let b = (a + rng.random_range(1..n)) % n;
+    loop {
+        let c = rng.random_range(0..n);
+        if c != a && c != b {
+            return [among[a], among[b], among[c]];
+        }
+    }
+}
+
+fn motion_of_sample(
+    rig: &StereoRig,
+    candidates: &[Candidate],
+    sample: &[usize; 3],
+) -> Option<Isometry3<f64>> {
+    let coarse = closed_form::align(sample.iter().filter_map(|&i| candidates[i].euclidean))?;
+    let mut motion = coarse;
+    for _ in 0..SAMPLE_STEPS {
+        match step(rig, sample.iter().map(|&i| &candidates[i]), &motion) {
+            Some(xi) => motion *= se3::exp(&xi),
+            None => return Some(coarse),
+        }
+    }
+    Some(motion)
+}
+
+/// One Gauss–Newton step on the tracks that agree with `motion`.
+fn refine_on_agreeing(
+    rig: &StereoRig,
+    candidates: &[Candidate],
+    motion: &Isometry3<f64>,
+    gate: f64,
+) -> Option<Isometry3<f64>> {
+    let agreeing = candidates
+        .iter()
+        .filter(|c| c.squared_sigmas(rig, motion) <= gate);
+    if agreeing.clone().count() < 3 {
+        return None;
+    }
+    Some(motion * se3::exp(&step(rig, agreeing, motion)?))
+}
+
+/// The Gauss–Newton step of the motion on some tracks, each weighted by its predicted covariance.
+fn step<'a>(
+    rig: &StereoRig,
+    candidates: impl Iterator<Item = &'a Candidate>,
+    prev_from_now: &Isometry3<f64>,
+) -> Option<Vector6<f64>> {
+    let now_from_prev = prev_from_now.inverse();
+    let mut hessian = Matrix6::zeros();
+    let mut gradient = Vector6::zeros();
+    for c in candidates {
+        let Some(seen) = sight::linearise(rig, &now_from_prev, &c.inverse_depth) else {
+            continue;
+        };
+        let weighted = seen.by_motion.transpose() * c.info;
+        hessian += weighted * seen.by_motion;
+        gradient += weighted * (c.now_px - seen.px);
+    }
+    let xi = hessian.cholesky()?.solve(&gradient);
+    xi.iter().all(|v| v.is_finite()).then_some(xi)
+}
+
+/// The best motion so far, by the sum of squared distances cut off at the gate.
+#[derive(Default)]
+struct Best {
+    motion: Option<Isometry3<f64>>,
+    score: f64,
+    agreeing: usize,
+}
+
+impl Best {
+    fn offer(
+        &mut self,
+        rig: &StereoRig,
+        candidates: &[Candidate],
+        motion: &Isometry3<f64>,
+        gate: f64,
+    ) {
+        let mut score = 0.0;
+        let mut agreeing = 0;
+        for (done, c) in candidates.iter().enumerate() {
+            let gain = gate - c.squared_sigmas(rig, motion);
+            if gain > 0.0 {
+                score += gain / gate;
+                agreeing += 1;
+            }
+            // Even full marks for the rest would not win.
+            if score + ((candidates.len() - done) as f64) < self.score {
+                return;
+            }
+        }
+        if score > self.score {
+            *self = Self {
+                motion: Some(*motion),
+                score,
+                agreeing,
+            };
+        }
+    }
+
+    /// How many samples make it sure enough that one was free of outliers.
+    fn samples_needed(&self, total: usize) -> u32 {
+        let share = self.agreeing as f64 / total.max(1) as f64;
+        let good = share.powi(3);
+        if good >= 1.0 {
+            return MIN_SAMPLES;
+        }
+        if good <= 0.0 {
+            return u32::MAX;
+        }
+        let needed = (MISS_PROBABILITY.ln() / (1.0 - good).ln()).ceil();
+        (needed as u32).max(MIN_SAMPLES)
+    }
+}

@@ -1,0 +1,309 @@
+//! Odometry: one motion after the other in, the pose with its covariance out (thesis §2.5, §3.4).
+//!
+//! Motions are measured against a *reference* pair, the last one whose motion was measured. Where
+//! a motion cannot be measured the pose is bridged by the last velocity, with a covariance that
+//! grows by what the robot's velocity may have changed; once the reference is recognised again the
+//! bridge is forgotten.
+
+use super::closed_form::MotionEstimate;
+use super::{Counts, ErrorBudget, MeasuredMotion, Odometry, Settings, Status};
+use crate::geometry::se3;
+use crate::uncertainty::compounding;
+use nalgebra::{Isometry3, Matrix6, Vector6};
+
+/// The origin is a pose by definition; its covariance only has to be positive definite: (1 µm)²,
+/// (1 µrad)².
+const ORIGIN_VARIANCE: f64 = 1e-12;
+/// 1 σ of a velocity that nothing is known about: m/s and rad/s.
+const UNKNOWN_SPEED_M_S: f64 = 10.0;
+const UNKNOWN_TURN_RAD_S: f64 = 3.0;
+const NS_PER_S: f64 = 1e9;
+
+/// Which pair an odometry row belongs to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct PairStamp {
+    /// The number of the pair in its recording.
+    pub sequence: u64,
+    /// When its left image was taken, ns.
+    pub timestamp_ns: i64,
+}
+
+/// A pose with its covariances, all of right perturbations.
+#[derive(Clone, Copy, Debug)]
+struct Place {
+    odom_from_camera: Isometry3<f64>,
+    timestamp_ns: i64,
+    detection: Matrix6<f64>,
+    bridging: Matrix6<f64>,
+}
+
+/// A velocity in the camera frame with its covariance, per second.
+#[derive(Clone, Copy, Debug)]
+struct Velocity {
+    twist: Vector6<f64>,
+    cov: Matrix6<f64>,
+}
+
+/// Chains motions to a pose.
+#[derive(Clone, Debug)]
+pub struct Odometer {
+    settings: Settings,
+    epoch: u32,
+    reference: Place,
+    last: Place,
+    /// From the reference to the last row: what bridging has added since.
+    reference_from_last: MotionEstimate,
+    velocity: Velocity,
+    bridged: u32,
+    tracked_in_epoch: bool,
+    variance_factor: f64,
+}
+
+impl Odometer {
+    /// Begins at the origin with the first pair.
+    #[must_use]
+    pub fn new(settings: Settings, stamp: PairStamp) -> Self {
+        let origin = Place {
+            odom_from_camera: Isometry3::identity(),
+            timestamp_ns: stamp.timestamp_ns,
+            detection: Matrix6::identity() * ORIGIN_VARIANCE,
+            bridging: Matrix6::zeros(),
+        };
+        Self {
+            settings,
+            epoch: 0,
+            reference: origin,
+            last: origin,
+            reference_from_last: no_motion(),
+            velocity: unknown_velocity(),
+            bridged: 0,
+            tracked_in_epoch: false,
+            variance_factor: 1.0,
+        }
+    }
+
+    /// The variance factor to expect of the next motion.
+    #[must_use]
+    pub fn expected_variance_factor(&self) -> f64 {
+        self.variance_factor
+    }
+
+    /// Whether a velocity has been measured, so that [`predict`](Self::predict) means something.
+    #[must_use]
+    pub fn has_velocity(&self) -> bool {
+        self.tracked_in_epoch
+    }
+
+    /// The motion since the reference that the last velocity leads to expect: `reference_from_now`.
+    #[must_use]
+    pub fn predict(&self, timestamp_ns: i64) -> Isometry3<f64> {
+        let since_last =
+            self.velocity.twist * seconds_between(self.last.timestamp_ns, timestamp_ns);
+        self.reference_from_last.prev_from_now * se3::exp(&since_last)
+    }
+
+    /// The row of the pair with which the odometer began, or with which it begins anew because
+    /// nothing has been tracked yet.
+    pub fn begin(&mut self, stamp: PairStamp, counts: Counts) -> Odometry {
+        self.reference.timestamp_ns = stamp.timestamp_ns;
+        self.last = self.reference;
+        self.reference_from_last = no_motion();
+        self.bridged = 0;
+        let motion = MotionEstimate {
+            cov_right: Matrix6::identity() * ORIGIN_VARIANCE,
+            ..no_motion()
+        };
+        self.row(stamp, Status::Initializing, &motion, counts, 1.0)
+    }
+
+    /// Whether any motion has been measured since the odometry frame began.
+    #[must_use]
+    pub fn has_tracked(&self) -> bool {
+        self.tracked_in_epoch
+    }
+
+    /// The row of a pair whose motion `reference_from_now` was measured; the pair becomes the
+    /// reference.
+    pub fn advance(
+        &mut self,
+        stamp: PairStamp,
+        measured: &MeasuredMotion,
+        counts: Counts,
+    ) -> Odometry {
+        let reference_from_now = measured.estimate.prev_from_now;
+        let cov = measured.estimate.cov_right;
+        let now = Place {
+            odom_from_camera: renormalised(self.reference.odom_from_camera * reference_from_now),
+            timestamp_ns: stamp.timestamp_ns,
+            detection: compounding::chain(&self.reference.detection, &reference_from_now, &cov),
+            bridging: compounding::carry(&self.reference.bridging, &reference_from_now),
+        };
+        let since_last = self.since_last_row(&measured.estimate);
+        let dt_s = seconds_between(self.last.timestamp_ns, stamp.timestamp_ns);
+        self.velocity = velocity_of(&since_last, dt_s);
+        self.variance_factor = 0.8 * self.variance_factor + 0.2 * measured.variance_factor;
+        self.tracked_in_epoch = true;
+        self.bridged = 0;
+        self.reference = now;
+        self.last = now;
+        self.reference_from_last = no_motion();
+        let status = if measured.inliers >= self.settings.good_inliers {
+            Status::Tracking
+        } else {
+            Status::Degraded
+        };
+        self.row(stamp, status, &since_last, counts, measured.variance_factor)
+    }
+
+    /// The row of a pair whose motion could not be measured: the pose goes on with the last
+    /// velocity.
+    pub fn bridge(&mut self, stamp: PairStamp, counts: Counts) -> Odometry {
+        let dt_s = seconds_between(self.last.timestamp_ns, stamp.timestamp_ns);
+        let motion = MotionEstimate {
+            prev_from_now: se3::exp(&(self.velocity.twist * dt_s)),
+            cov_right: self.bridge_growth(stamp.timestamp_ns),
+        };
+        let step = &motion.prev_from_now;
+        self.last = Place {
+            odom_from_camera: renormalised(self.last.odom_from_camera * step),
+            timestamp_ns: stamp.timestamp_ns,
+            detection: compounding::carry(&self.last.detection, step),
+            bridging: compounding::chain(&self.last.bridging, step, &motion.cov_right),
+        };
+        self.reference_from_last = MotionEstimate {
+            prev_from_now: self.reference_from_last.prev_from_now * step,
+            cov_right: compounding::chain(
+                &self.reference_from_last.cov_right,
+                step,
+                &motion.cov_right,
+            ),
+        };
+        self.bridged += 1;
+        self.row(stamp, Status::Lost, &motion, counts, self.variance_factor)
+    }
+
+    /// Whether the reference has been out of sight for so long that the frame should begin anew.
+    #[must_use]
+    pub fn should_begin_anew(&self) -> bool {
+        self.bridged >= self.settings.max_bridged
+    }
+
+    /// Begins a new epoch where the last row stands: the pose goes on, but the link to what came
+    /// before is bridged, not measured.
+    pub fn begin_anew(&mut self, stamp: PairStamp, counts: Counts) -> Odometry {
+        let mut row = self.bridge(stamp, counts);
+        self.epoch += 1;
+        self.reference = self.last;
+        self.reference_from_last = no_motion();
+        self.velocity = unknown_velocity();
+        self.bridged = 0;
+        self.tracked_in_epoch = false;
+        row.epoch = self.epoch;
+        row.status = Status::Initializing;
+        row
+    }
+
+    /// By how much one more bridged row widens the pose. Over the time T since the last
+    /// measurement, velocity contributes σ_v T and its change ½ a T²: not independent from row to
+    /// row, so that each adds the difference of the totals.
+    fn bridge_growth(&self, timestamp_ns: i64) -> Matrix6<f64> {
+        let total = |to_ns: i64| {
+            let t = seconds_between(self.reference.timestamp_ns, to_ns);
+            let (a, alpha) = (
+                0.5 * self.settings.acceleration_m_s2 * t * t,
+                0.5 * self.settings.angular_acceleration_rad_s2 * t * t,
+            );
+            let change = Vector6::new(a, a, a, alpha, alpha, alpha);
+            self.velocity.cov * (t * t) + Matrix6::from_diagonal(&change.component_mul(&change))
+        };
+        let growth = total(timestamp_ns) - total(self.last.timestamp_ns);
+        se3::symmetric(&growth) + Matrix6::identity() * ORIGIN_VARIANCE
+    }
+
+    /// The motion since the last row, from the motion since the reference.
+    fn since_last_row(&self, reference_from_now: &MotionEstimate) -> MotionEstimate {
+        if self.bridged == 0 {
+            return *reference_from_now;
+        }
+        let last_from_reference = self.reference_from_last.prev_from_now.inverse();
+        let last_from_now = last_from_reference * reference_from_now.prev_from_now;
+        // The bridge's error stands to the left of the motion: carried over by the adjoint.
+        MotionEstimate {
+            prev_from_now: last_from_now,
+            cov_right: compounding::chain(
+                &self.reference_from_last.cov_right,
+                &last_from_now,
+                &reference_from_now.cov_right,
+            ),
+        }
+    }
+
+    fn row(
+        &self,
+        stamp: PairStamp,
+        status: Status,
+        motion: &MotionEstimate,
+        counts: Counts,
+        variance_factor: f64,
+    ) -> Odometry {
+        let pose = &self.last.odom_from_camera;
+        let budget = ErrorBudget {
+            detection: se3::cov_fixed_axes_from_right(pose, &self.last.detection),
+            bridging: se3::cov_fixed_axes_from_right(pose, &self.last.bridging),
+        };
+        Odometry {
+            sequence: stamp.sequence,
+            timestamp_ns: stamp.timestamp_ns,
+            epoch: self.epoch,
+            status,
+            odom_from_camera: *pose,
+            cov_pose: budget.detection + budget.bridging,
+            prev_from_now: motion.prev_from_now,
+            cov_motion: se3::cov_fixed_axes_from_right(&motion.prev_from_now, &motion.cov_right),
+            twist: self.velocity.twist,
+            cov_twist: self.velocity.cov,
+            budget,
+            counts,
+            variance_factor,
+        }
+    }
+}
+
+fn no_motion() -> MotionEstimate {
+    MotionEstimate {
+        prev_from_now: Isometry3::identity(),
+        cov_right: Matrix6::zeros(),
+    }
+}
+
+fn unknown_velocity() -> Velocity {
+    let (v, w) = (UNKNOWN_SPEED_M_S, UNKNOWN_TURN_RAD_S);
+    let sigma = Vector6::new(v, v, v, w, w, w);
+    Velocity {
+        twist: Vector6::zeros(),
+        cov: Matrix6::from_diagonal(&sigma.component_mul(&sigma)),
+    }
+}
+
+fn velocity_of(motion: &MotionEstimate, dt_s: f64) -> Velocity {
+    if dt_s <= 0.0 {
+        return unknown_velocity();
+    }
+    let xi = se3::log(&motion.prev_from_now);
+    let by_right = se3::right_jacobian_inverse(&xi) / dt_s;
+    Velocity {
+        twist: xi / dt_s,
+        cov: se3::symmetric(&(by_right * motion.cov_right * by_right.transpose())),
+    }
+}
+
+/// Time from one stamp to a later one, s; 0 where the clock went backwards.
+fn seconds_between(from_ns: i64, to_ns: i64) -> f64 {
+    (to_ns.saturating_sub(from_ns).max(0)) as f64 / NS_PER_S
+}
+
+/// Takes out what rounding did to the quaternion's length.
+fn renormalised(mut pose: Isometry3<f64>) -> Isometry3<f64> {
+    pose.rotation.renormalize();
+    pose
+}

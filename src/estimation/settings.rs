@@ -1,0 +1,81 @@
+//! How motion is estimated.
+
+use crate::settings::SettingError;
+use serde::{Deserialize, Serialize};
+
+/// Which estimator.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Method {
+    /// Closed form on triangulated points, as the thesis has it: simple, and coarse.
+    Svd,
+    /// Two-frame stereo bundle adjustment in the images.
+    #[default]
+    Bundle,
+}
+
+/// How motion is estimated.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// The estimator: "svd" or "bundle". Default "bundle": the closed form is a hundred times
+    /// coarser on distant points.
+    pub method: Method,
+    /// Tracks that must agree for a motion to count as measured. 3 to 1000, default 12: below, one
+    /// wrong track can lead the estimate.
+    pub min_inliers: u32,
+    /// Tracks that must agree for a motion to be called good. 3 to 10000, default 30.
+    pub good_inliers: u32,
+    /// Samples that consensus may draw. 10 to 100000, default 500: finds a consensus of a quarter
+    /// of the tracks with 99.9 %.
+    pub max_samples: u32,
+    /// Largest squared residual of a track that counts. σ², 1 to 100, default 20: of Gaussian ones
+    /// (five degrees of freedom) 0.1 % are larger.
+    pub gate_sigma2: f64,
+    /// Seed of consensus. Any, default 1: the same seed gives the same bits.
+    pub seed: u64,
+    /// Pairs without a measured motion that are bridged before the odometry frame begins anew. 0 to
+    /// 10000, default 20.
+    pub max_bridged: u32,
+    /// How much a robot's velocity may change while it is bridged, 1 σ. m/s², above 0 to 1000,
+    /// default 2.
+    pub acceleration_m_s2: f64,
+    /// The same for its turn rate. rad/s², above 0 to 1000, default 2.
+    pub angular_acceleration_rad_s2: f64,
+}
+
+impl Default for Settings {
+    fn default() -> Self {
+        Self {
+            method: Method::Bundle,
+            min_inliers: 12,
+            good_inliers: 30,
+            max_samples: 500,
+            gate_sigma2: 20.0,
+            seed: 1,
+            max_bridged: 20,
+            acceleration_m_s2: 2.0,
+            angular_acceleration_rad_s2: 2.0,
+        }
+    }
+}
+
+impl Settings {
+    /// Refuses values out of range.
+    ///
+    /// # Errors
+    /// The first setting out of range.
+    pub fn check(&self) -> Result<(), SettingError> {
+        SettingError::unless_in("min_inliers", self.min_inliers, 3..=1000)?;
+        SettingError::unless_in("good_inliers", self.good_inliers, 3..=10_000)?;
+        SettingError::unless_in("max_samples", self.max_samples, 10..=100_000)?;
+        SettingError::unless_in("gate_sigma2", self.gate_sigma2, 1.0..=100.0)?;
+        SettingError::unless_in("max_bridged", self.max_bridged, 0..=10_000)?;
+        SettingError::unless_in("acceleration_m_s2", self.acceleration_m_s2, 1e-6..=1000.0)?;
+        SettingError::unless_in(
+            "angular_acceleration_rad_s2",
+            self.angular_acceleration_rad_s2,
+            1e-6..=1000.0,
+        )
+    }
+}

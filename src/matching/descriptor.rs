@@ -1,0 +1,117 @@
+//! Comparing descriptors: distance, the best of several candidates, and the tests a match passes.
+
+use super::Settings;
+use crate::features::{Features, Keypoint};
+
+/// Lanes of partial sums: the compiler turns them into vector registers, and the fixed order of
+/// additions keeps the bits the same everywhere.
+const LANES: usize = 16;
+
+/// Squared Euclidean distance of two descriptors of equal length.
+pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+    let mut sums = [0.0_f32; LANES];
+    let (a_blocks, a_rest) = a.as_chunks::<LANES>();
+    let (b_blocks, b_rest) = b.as_chunks::<LANES>();
+    for (x, y) in a_blocks.iter().zip(b_blocks) {
+        for lane in 0..LANES {
+            let d = x[lane] - y[lane];
+            sums[lane] += d * d;
+        }
+    }
+    let rest: f32 = a_rest
+        .iter()
+        .zip(b_rest)
+        .map(|(x, y)| (x - y) * (x - y))
+        .sum();
+    let mut width = LANES / 2;
+    while width > 0 {
+        for lane in 0..width {
+            sums[lane] += sums[lane + width];
+        }
+        width /= 2;
+    }
+    sums[0] + rest
+}
+
+/// The best and the second best candidate of one feature.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Best {
+    index: u32,
+    squared: f32,
+    second_squared: f32,
+}
+
+impl Best {
+    /// Before any candidate was seen.
+    pub(super) const NONE: Self = Self {
+        index: u32::MAX,
+        squared: f32::INFINITY,
+        second_squared: f32::INFINITY,
+    };
+
+    /// Takes note of a candidate.
+    pub(super) fn offer(&mut self, index: u32, squared: f32) {
+        if squared < self.squared {
+            self.second_squared = self.squared;
+            self.squared = squared;
+            self.index = index;
+        } else if squared < self.second_squared {
+            self.second_squared = squared;
+        }
+    }
+
+    /// The winner, if it is near enough and clearly nearer than the second.
+    pub(super) fn accepted(&self, settings: &Settings) -> Option<u32> {
+        let ratio2 = settings.max_ratio * settings.max_ratio;
+        let limit2 = settings.max_distance * settings.max_distance;
+        (self.index != u32::MAX
+            && self.squared <= limit2
+            && self.squared <= ratio2 * self.second_squared)
+            .then_some(self.index)
+    }
+}
+
+/// Whether two keypoints can be the same spot at all: same polarity, similar size.
+pub(super) fn compatible(a: &Keypoint, b: &Keypoint, settings: &Settings) -> bool {
+    a.laplacian == b.laplacian
+        && a.size_px <= b.size_px * settings.max_size_ratio
+        && b.size_px <= a.size_px * settings.max_size_ratio
+}
+
+/// The distance of feature `i` of `a` to feature `j` of `b`, squared.
+pub(super) fn distance_between(a: &Features, i: u32, b: &Features, j: u32) -> f32 {
+    squared_distance(a.descriptor(i as usize), b.descriptor(j as usize))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn distance_agrees_with_the_plain_sum(
+            pairs in prop::collection::vec((-1.0..1.0_f32, -1.0..1.0_f32), 0..200)
+        ) {
+            let (a, b): (Vec<f32>, Vec<f32>) = pairs.iter().copied().unzip();
+            let plain: f64 = pairs.iter().map(|(x, y)| f64::from(x - y).powi(2)).sum();
+            prop_assert!((f64::from(squared_distance(&a, &b)) - plain).abs() <= 1e-5 * plain.max(1.0));
+        }
+    }
+
+    #[test]
+    fn the_best_two_are_kept_in_any_order() {
+        let settings = Settings::default();
+        for order in [[0.09, 0.25, 0.16], [0.25, 0.16, 0.09], [0.16, 0.09, 0.25]] {
+            let mut best = Best::NONE;
+            for (i, d) in order.into_iter().enumerate() {
+                best.offer(i as u32, d);
+            }
+            assert_eq!((best.squared, best.second_squared), (0.09, 0.16));
+            // √(0.09 / 0.16) = 0.75 passes a ratio of 0.85.
+            let winner = order.iter().position(|&d| d == 0.09).map(|i| i as u32);
+            assert_eq!(best.accepted(&settings), winner);
+        }
+        assert_eq!(Best::NONE.accepted(&settings), None);
+    }
+}
