@@ -3,6 +3,21 @@
 //! A [`PairSource`] hands out one [`PairEvent`] after the other until its recording ends. What goes
 //! wrong with one pair is an event, not the end of the run.
 
+pub mod dataset;
+pub mod decode;
+mod euroc;
+mod jpeg;
+mod kitti;
+mod own;
+pub mod pace;
+pub mod read_ahead;
+mod text;
+mod yaml;
+
+pub use dataset::{Dataset, DatasetError, Layout};
+pub use pace::Realtime;
+pub use read_ahead::ReadAhead;
+
 use crate::image::GrayImage;
 
 /// Which of the two cameras.
@@ -55,5 +70,32 @@ pub trait PairSource: Send {
     /// How many events there will be in all, where that is known.
     fn len_hint(&self) -> Option<u64> {
         None
+    }
+
+    /// Takes back a pair that is done with, so that its buffers can be filled again.
+    ///
+    /// Nobody has to call it; a source without a pool drops the pair.
+    fn recycle(&mut self, pair: StereoPair) {
+        drop(pair);
+    }
+}
+
+impl PairEvent {
+    /// The number of the pair in its recording.
+    #[must_use]
+    pub fn sequence(&self) -> u64 {
+        match self {
+            Self::Pair(pair) => pair.sequence,
+            Self::Unusable(unusable) => unusable.sequence,
+        }
+    }
+
+    /// When it was taken, ns, where that is known.
+    #[must_use]
+    pub fn timestamp_ns(&self) -> Option<i64> {
+        match self {
+            Self::Pair(pair) => Some(pair.timestamp_ns),
+            Self::Unusable(unusable) => unusable.timestamp_ns,
+        }
     }
 }

@@ -1,0 +1,414 @@
+//! Image files in; 8-bit grey images out, or one sentence why not.
+//!
+//! PNG, JPEG, PGM and PPM, 8 or 16 bits a sample, grey or colour; alpha is ignored. Only whole
+//! images come out: a truncated or damaged file is an error, never a picture with a grey end.
+
+use super::jpeg;
+use crate::image::GrayImage;
+use image::codecs::{png::PngDecoder, pnm::PnmDecoder};
+use image::{ColorType, ImageDecoder, ImageError, Limits};
+use std::error::Error;
+use std::fs::File;
+use std::io::{Cursor, ErrorKind, Read};
+use std::path::{Path, PathBuf};
+
+/// Longest image side that is decoded, px.
+pub const MAX_SIDE_PX: u32 = 16_384;
+/// Longest file that is read, bytes.
+pub const MAX_FILE_BYTES: u64 = 1 << 30;
+/// Most memory that the decoded samples of one image may take, bytes.
+const MAX_SAMPLE_BYTES: u64 = 1 << 30;
+
+/// Why a file did not become an image.
+#[derive(Debug, thiserror::Error)]
+pub enum DecodeError {
+    /// The file is missing, or the system refuses to read it.
+    #[error("{}: cannot be read: {cause}", file.display())]
+    Unreadable {
+        /// The file.
+        file: PathBuf,
+        /// What the system says.
+        cause: std::io::Error,
+    },
+    /// The path leads to a folder, a pipe or a device.
+    #[error("{}: is not a file", file.display())]
+    NotAFile {
+        /// The path.
+        file: PathBuf,
+    },
+    /// The file holds nothing.
+    #[error("{}: the file is empty", file.display())]
+    Empty {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The file is longer than any image that is read.
+    #[error("{}: has {bytes} bytes, more than {MAX_FILE_BYTES}", file.display())]
+    FileTooLong {
+        /// The file.
+        file: PathBuf,
+        /// Its length, bytes.
+        bytes: u64,
+    },
+    /// The first bytes are those of no image that is read.
+    #[error("{}: is not a PNG, JPEG, PGM or PPM image", file.display())]
+    UnknownFormat {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The image is larger than any that is decoded.
+    #[error("{}: {width}×{height} px are more than can be decoded", file.display())]
+    TooLarge {
+        /// The file.
+        file: PathBuf,
+        /// Width, px.
+        width: u32,
+        /// Height, px.
+        height: u32,
+    },
+    /// The image is not of the size that was asked for.
+    #[error(
+        "{}: the image has {width}×{height} px, but the rig's {expected_width}×{expected_height}",
+        file.display()
+    )]
+    WrongSize {
+        /// The file.
+        file: PathBuf,
+        /// Width, px.
+        width: u32,
+        /// Height, px.
+        height: u32,
+        /// Width that was asked for, px.
+        expected_width: u32,
+        /// Height that was asked for, px.
+        expected_height: u32,
+    },
+    /// The file ends before the image does.
+    #[error("{}: the file ends before the image does", file.display())]
+    Truncated {
+        /// The file.
+        file: PathBuf,
+    },
+    /// The file's content breaks the rules of its format.
+    #[error("{}: is damaged: {cause}", file.display())]
+    Damaged {
+        /// The file.
+        file: PathBuf,
+        /// What the decoder says.
+        cause: String,
+    },
+}
+
+/// What goes wrong inside a file; the file's name is added where it is known.
+pub(super) enum Fault {
+    Truncated,
+    TooLarge(u32, u32),
+    WrongSize((u32, u32), (u32, u32)),
+    UnknownFormat,
+    Damaged(String),
+}
+
+impl From<ImageError> for Fault {
+    fn from(error: ImageError) -> Self {
+        let is_end = |e: &std::io::Error| e.kind() == ErrorKind::UnexpectedEof;
+        // A decoder hands the end of its input on, or wraps it in an error of its own.
+        let mut wrapped = error.source();
+        let mut ends = matches!(&error, ImageError::IoError(e) if is_end(e));
+        while let Some(inner) = wrapped {
+            ends |= inner.downcast_ref().is_some_and(is_end);
+            wrapped = inner.source();
+        }
+        if ends {
+            return Self::Truncated;
+        }
+        Self::Damaged(error.to_string().replace('\n', " "))
+    }
+}
+
+/// Decodes one file after the other with the same buffers.
+#[derive(Debug)]
+pub struct Decoder {
+    white_level: u16,
+    file_bytes: Vec<u8>,
+    samples: Vec<u8>,
+}
+
+impl Default for Decoder {
+    fn default() -> Self {
+        Self::new(u16::MAX)
+    }
+}
+
+impl Decoder {
+    /// A decoder that maps the 16-bit sample `white_level` (at least 1) to 255, and what lies above
+    /// it as well.
+    ///
+    /// A camera that stores 12 bits in 16 has the white level 4095. Samples of 8 bits, and those of
+    /// a PGM or PPM that states another white than 65535, are not affected.
+    #[must_use]
+    pub fn new(white_level: u16) -> Self {
+        Self {
+            white_level: white_level.max(1),
+            file_bytes: Vec::new(),
+            samples: Vec::new(),
+        }
+    }
+
+    /// Decodes `file` into `image`, whose memory is used again; its pixels are unspecified after an
+    /// error. `expected_px` is the width and height that the image must have, if any.
+    ///
+    /// # Errors
+    /// See the variants of [`DecodeError`].
+    pub fn decode(
+        &mut self,
+        file: &Path,
+        expected_px: Option<(u32, u32)>,
+        image: &mut GrayImage,
+    ) -> Result<(), DecodeError> {
+        self.file_bytes.clear();
+        let length = checked_length(file)?;
+        read(file, length, &mut self.file_bytes)?;
+        let mut target = Target {
+            expected_px,
+            white_level: self.white_level,
+            samples: &mut self.samples,
+            image,
+        };
+        target
+            .decode(&self.file_bytes)
+            .map_err(|fault| with_name(fault, file))
+    }
+
+    /// The width and height of the image in `file`, px, from its header.
+    ///
+    /// # Errors
+    /// The file cannot be read or its header makes no sense.
+    pub fn size_px(&mut self, file: &Path) -> Result<(u32, u32), DecodeError> {
+        self.file_bytes.clear();
+        let length = checked_length(file)?;
+        read(file, length, &mut self.file_bytes)?;
+        header_size_px(&self.file_bytes).map_err(|fault| with_name(fault, file))
+    }
+}
+
+/// The length of `file`, bytes, unless it cannot hold an image.
+fn checked_length(file: &Path) -> Result<u64, DecodeError> {
+    let meta = std::fs::metadata(file).map_err(|cause| DecodeError::Unreadable {
+        file: file.to_owned(),
+        cause,
+    })?;
+    let named = || file.to_owned();
+    match meta.len() {
+        _ if !meta.is_file() => Err(DecodeError::NotAFile { file: named() }),
+        0 => Err(DecodeError::Empty { file: named() }),
+        bytes if bytes > MAX_FILE_BYTES => Err(DecodeError::FileTooLong {
+            file: named(),
+            bytes,
+        }),
+        bytes => Ok(bytes),
+    }
+}
+
+fn read(file: &Path, length: u64, bytes: &mut Vec<u8>) -> Result<(), DecodeError> {
+    let unreadable = |cause| DecodeError::Unreadable {
+        file: file.to_owned(),
+        cause,
+    };
+    bytes.reserve(usize::try_from(length).unwrap_or(0));
+    let opened = File::open(file).map_err(unreadable)?;
+    // A file that grows meanwhile does not get past the limit.
+    opened
+        .take(MAX_FILE_BYTES)
+        .read_to_end(bytes)
+        .map_err(unreadable)?;
+    Ok(())
+}
+
+fn with_name(fault: Fault, file: &Path) -> DecodeError {
+    let file = file.to_owned();
+    match fault {
+        Fault::Truncated => DecodeError::Truncated { file },
+        Fault::UnknownFormat => DecodeError::UnknownFormat { file },
+        Fault::Damaged(cause) => DecodeError::Damaged { file, cause },
+        Fault::TooLarge(width, height) => DecodeError::TooLarge {
+            file,
+            width,
+            height,
+        },
+        Fault::WrongSize((width, height), (expected_width, expected_height)) => {
+            DecodeError::WrongSize {
+                file,
+                width,
+                height,
+                expected_width,
+                expected_height,
+            }
+        }
+    }
+}
+
+enum Format {
+    Png,
+    Jpeg,
+    Pnm,
+}
+
+fn format_of(bytes: &[u8]) -> Result<Format, Fault> {
+    match bytes {
+        [0x89, b'P', b'N', b'G', ..] => Ok(Format::Png),
+        [0xFF, 0xD8, ..] => Ok(Format::Jpeg),
+        [b'P', b'2' | b'3' | b'5' | b'6', ..] => Ok(Format::Pnm),
+        _ => Err(Fault::UnknownFormat),
+    }
+}
+
+fn png(bytes: &[u8]) -> Result<PngDecoder<Cursor<&[u8]>>, Fault> {
+    // The sides are checked by `Target::admit`, with a better sentence.
+    let mut limits = Limits::no_limits();
+    limits.max_alloc = Some(MAX_SAMPLE_BYTES);
+    Ok(PngDecoder::with_limits(Cursor::new(bytes), limits)?)
+}
+
+fn header_size_px(bytes: &[u8]) -> Result<(u32, u32), Fault> {
+    match format_of(bytes)? {
+        Format::Png => Ok(png(bytes)?.dimensions()),
+        Format::Pnm => Ok(PnmDecoder::new(Cursor::new(bytes))?.dimensions()),
+        Format::Jpeg => Ok(jpeg::Jpeg::open(bytes)?.size_px()),
+    }
+}
+
+/// Where an image goes, and under which conditions.
+struct Target<'a> {
+    expected_px: Option<(u32, u32)>,
+    white_level: u16,
+    samples: &'a mut Vec<u8>,
+    image: &'a mut GrayImage,
+}
+
+impl Target<'_> {
+    fn decode(&mut self, bytes: &[u8]) -> Result<(), Fault> {
+        match format_of(bytes)? {
+            Format::Png => {
+                let decoder = png(bytes)?;
+                self.fill(decoder, self.white_level)
+            }
+            Format::Pnm => {
+                let decoder = PnmDecoder::new(Cursor::new(bytes))?;
+                // The decoder has already stretched the samples to the white that the file states.
+                let own_white = decoder.header().maximal_sample() != u32::from(u16::MAX);
+                let white_level = if own_white {
+                    u16::MAX
+                } else {
+                    self.white_level
+                };
+                self.fill(decoder, white_level)
+            }
+            Format::Jpeg => {
+                let mut decoder = jpeg::Jpeg::open(bytes)?;
+                let size = decoder.size_px();
+                self.admit(size, decoder.bytes_per_pixel())?;
+                if decoder.bytes_per_pixel() == 1 {
+                    return decoder.read(self.image.pixels_mut());
+                }
+                resize(self.samples, size, decoder.bytes_per_pixel());
+                decoder.read(self.samples)?;
+                grey_from_colour8(self.samples, 3, self.image.pixels_mut());
+                Ok(())
+            }
+        }
+    }
+
+    /// Refuses an image by its header, before memory is taken, and makes room for its pixels.
+    fn admit(&mut self, size: (u32, u32), bytes_per_pixel: u8) -> Result<(), Fault> {
+        let (width, height) = size;
+        if let Some(expected) = self.expected_px
+            && expected != size
+        {
+            return Err(Fault::WrongSize(size, expected));
+        }
+        let sample_bytes = u64::from(width) * u64::from(height) * u64::from(bytes_per_pixel);
+        if width.max(height) > MAX_SIDE_PX || sample_bytes > MAX_SAMPLE_BYTES {
+            return Err(Fault::TooLarge(width, height));
+        }
+        if width.min(height) == 0 {
+            return Err(Fault::Damaged(format!("it has {width}×{height} px")));
+        }
+        self.image.reshape(width, height);
+        Ok(())
+    }
+
+    fn fill(&mut self, decoder: impl ImageDecoder, white_level: u16) -> Result<(), Fault> {
+        let (size, color) = (decoder.dimensions(), decoder.color_type());
+        self.admit(size, color.bytes_per_pixel())?;
+        if color == ColorType::L8 {
+            return Ok(decoder.read_image(self.image.pixels_mut())?);
+        }
+        resize(self.samples, size, color.bytes_per_pixel());
+        decoder.read_image(self.samples)?;
+        let (samples, grey) = (self.samples.as_slice(), self.image.pixels_mut());
+        match color {
+            ColorType::La8 => grey_from_first8(samples, 2, grey),
+            ColorType::Rgb8 => grey_from_colour8(samples, 3, grey),
+            ColorType::Rgba8 => grey_from_colour8(samples, 4, grey),
+            ColorType::L16 => grey_from_grey16(samples, 1, white_level, grey),
+            ColorType::La16 => grey_from_grey16(samples, 2, white_level, grey),
+            ColorType::Rgb16 => grey_from_colour16(samples, 3, white_level, grey),
+            ColorType::Rgba16 => grey_from_colour16(samples, 4, white_level, grey),
+            other => {
+                return Err(Fault::Damaged(format!(
+                    "samples of {other:?} are not known"
+                )));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn resize(samples: &mut Vec<u8>, (width, height): (u32, u32), bytes_per_pixel: u8) {
+    let length = width as usize * height as usize * usize::from(bytes_per_pixel);
+    samples.resize(length, 0);
+}
+
+/// Luma in thousandths of a sample, with the weights of ITU-R BT.601 that OpenCV uses.
+fn luma_thousandths(r: u32, g: u32, b: u32) -> u32 {
+    299 * r + 587 * g + 114 * b
+}
+
+fn grey_from_first8(samples: &[u8], channels: usize, grey: &mut [u8]) {
+    for (pixel, out) in samples.chunks_exact(channels).zip(grey) {
+        *out = pixel[0];
+    }
+}
+
+fn grey_from_colour8(samples: &[u8], channels: usize, grey: &mut [u8]) {
+    for (pixel, out) in samples.chunks_exact(channels).zip(grey) {
+        let [r, g, b] = [pixel[0], pixel[1], pixel[2]].map(u32::from);
+        // At most 255, as the weights add up to one.
+        *out = ((luma_thousandths(r, g, b) + 500) / 1000) as u8;
+    }
+}
+
+/// `share` of `white` as 0 to 255, rounded, never above.
+fn byte_from_share(share: u64, white: u64) -> u8 {
+    u8::try_from((share * 255 + white / 2) / white).unwrap_or(u8::MAX)
+}
+
+fn grey_from_grey16(samples: &[u8], channels: usize, white_level: u16, grey: &mut [u8]) {
+    for (pixel, out) in samples.chunks_exact(2 * channels).zip(grey) {
+        let sample = u16::from_ne_bytes([pixel[0], pixel[1]]);
+        *out = byte_from_share(u64::from(sample), u64::from(white_level));
+    }
+}
+
+fn grey_from_colour16(samples: &[u8], channels: usize, white_level: u16, grey: &mut [u8]) {
+    let white = u64::from(white_level) * 1000;
+    for (pixel, out) in samples.chunks_exact(2 * channels).zip(grey) {
+        let sample = |at: usize| u32::from(u16::from_ne_bytes([pixel[at], pixel[at + 1]]));
+        let luma = luma_thousandths(sample(0), sample(2), sample(4));
+        *out = byte_from_share(u64::from(luma), white);
+    }
+}
+
+#[cfg(test)]
+#[path = "decode_tests.rs"]
+mod tests;

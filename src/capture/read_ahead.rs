@@ -1,0 +1,270 @@
+//! A recording's files in; decoded pairs out, in order, made ready ahead of the consumer.
+//!
+//! One thread a side decodes into its own bounded queue; the consumer takes one image from each.
+//! Buffers given back by [`recycle`](PairSource::recycle) are filled again.
+
+use super::dataset::{Dataset, ImageFiles, PairFiles};
+use super::decode::Decoder;
+use super::{PairEvent, PairSource, StereoPair, Unusable};
+use crate::image::GrayImage;
+use crossbeam_channel::{Receiver, Sender, bounded};
+use std::panic::{AssertUnwindSafe, catch_unwind};
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::thread::JoinHandle;
+
+/// One side's answer to one pair: the image, or a sentence why there is none.
+type Decoded = Result<GrayImage, String>;
+
+/// Plays a [`Dataset`], decoding ahead.
+///
+/// Dropping it early stops its threads after the image that each is at.
+#[derive(Debug)]
+pub struct ReadAhead {
+    pairs: Arc<[PairFiles]>,
+    next: usize,
+    left: Side,
+    right: Side,
+}
+
+impl ReadAhead {
+    /// Starts to read `dataset` from its first pair.
+    ///
+    /// # Errors
+    /// The system refuses a thread.
+    pub fn start(dataset: &Dataset) -> std::io::Result<Self> {
+        let pairs: Arc<[PairFiles]> = dataset.pairs.clone().into();
+        let side =
+            |name: &str, width: u32, height: u32, pick: fn(&ImageFiles) -> Option<&PathBuf>| {
+                let mut decoder = Decoder::new(dataset.settings.white_level);
+                Side::start(
+                    name,
+                    dataset.settings.read_ahead,
+                    Arc::clone(&pairs),
+                    pick,
+                    move |file, image| {
+                        decoder
+                            .decode(file, Some((width, height)), image)
+                            .map_err(|e| e.to_string())
+                    },
+                )
+            };
+        let cameras = (&dataset.rig.left, &dataset.rig.right);
+        Ok(Self {
+            left: side("read-left", cameras.0.width, cameras.0.height, left_of)?,
+            right: side("read-right", cameras.1.width, cameras.1.height, right_of)?,
+            pairs,
+            next: 0,
+        })
+    }
+}
+
+fn left_of(images: &ImageFiles) -> Option<&PathBuf> {
+    match images {
+        ImageFiles::Both { left, .. } => Some(left),
+        ImageFiles::Unpaired { .. } => None,
+    }
+}
+
+fn right_of(images: &ImageFiles) -> Option<&PathBuf> {
+    match images {
+        ImageFiles::Both { right, .. } => Some(right),
+        ImageFiles::Unpaired { .. } => None,
+    }
+}
+
+impl PairSource for ReadAhead {
+    fn next_event(&mut self) -> Option<PairEvent> {
+        let files = self.pairs.get(self.next)?;
+        let sequence = self.next as u64;
+        self.next += 1;
+        let timestamp_ns = files.timestamp_ns;
+        let unusable = |why| {
+            Some(PairEvent::Unusable(Unusable {
+                sequence,
+                timestamp_ns: Some(timestamp_ns),
+                why,
+            }))
+        };
+        if let ImageFiles::Unpaired { why } = &files.images {
+            return unusable(why.clone());
+        }
+        match (self.left.take(), self.right.take()) {
+            (Ok(left), Ok(right)) => Some(PairEvent::Pair(StereoPair {
+                sequence,
+                timestamp_ns,
+                left,
+                right,
+            })),
+            (Err(left), Err(right)) => unusable(format!("{left}; {right}")),
+            (Ok(image), Err(why)) => {
+                self.left.give_back(image);
+                unusable(why)
+            }
+            (Err(why), Ok(image)) => {
+                self.right.give_back(image);
+                unusable(why)
+            }
+        }
+    }
+
+    fn len_hint(&self) -> Option<u64> {
+        Some(self.pairs.len() as u64)
+    }
+
+    fn recycle(&mut self, pair: StereoPair) {
+        self.left.give_back(pair.left);
+        self.right.give_back(pair.right);
+    }
+}
+
+/// The thread that decodes one camera's images, seen from the consumer.
+#[derive(Debug)]
+struct Side {
+    /// `None` once the side is being dropped, which is what stops the thread.
+    decoded: Option<Receiver<Decoded>>,
+    spare: Sender<GrayImage>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Side {
+    /// `pick` chooses this side's file of a pair; `decode` fills an image from it.
+    fn start(
+        name: &str,
+        depth: usize,
+        pairs: Arc<[PairFiles]>,
+        pick: fn(&ImageFiles) -> Option<&PathBuf>,
+        mut decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
+    ) -> std::io::Result<Self> {
+        let (to_consumer, decoded) = bounded(depth);
+        // As many as can be under way: in the queue, with the consumer and in the decoder.
+        let (spare, spares) = bounded::<GrayImage>(depth + 2);
+        let thread = std::thread::Builder::new()
+            .name(name.to_owned())
+            .spawn(move || {
+                for file in pairs.iter().filter_map(|pair| pick(&pair.images)) {
+                    let image = spares.try_recv().unwrap_or_default();
+                    let answer = decode_safely(&mut decode, file, image);
+                    if to_consumer.send(answer).is_err() {
+                        return;
+                    }
+                }
+            })?;
+        Ok(Self {
+            decoded: Some(decoded),
+            spare,
+            thread: Some(thread),
+        })
+    }
+
+    /// The next image. A thread that has died is an answer, too: nobody waits for it.
+    fn take(&self) -> Decoded {
+        let gone = || "the thread that decodes images has ended".to_owned();
+        self.decoded
+            .as_ref()
+            .ok_or_else(gone)?
+            .recv()
+            .map_err(|_| gone())?
+    }
+
+    fn give_back(&self, image: GrayImage) {
+        // A full pool has no use for one more.
+        let _ = self.spare.try_send(image);
+    }
+}
+
+/// A decoder that panics over a strange file costs that file, not the run.
+fn decode_safely(
+    decode: &mut impl FnMut(&Path, &mut GrayImage) -> Result<(), String>,
+    file: &Path,
+    mut image: GrayImage,
+) -> Decoded {
+    // Unwind safe: all that a panic leaves half done are buffers, which each call fills anew.
+    match catch_unwind(AssertUnwindSafe(|| decode(file, &mut image))) {
+        Ok(Ok(())) => Ok(image),
+        Ok(Err(why)) => Err(why),
+        Err(_) => Err(format!("{}: the decoder failed on it", file.display())),
+    }
+}
+
+impl Drop for Side {
+    fn drop(&mut self) {
+        self.decoded = None;
+        if let Some(thread) = self.thread.take() {
+            // It ends within the image it is at; a panic in it has been reported already.
+            let _ = thread.join();
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn pairs(count: usize) -> Arc<[PairFiles]> {
+        (0..count)
+            .map(|index| PairFiles {
+                timestamp_ns: index as i64,
+                images: ImageFiles::Both {
+                    left: format!("{index}").into(),
+                    right: format!("{index}").into(),
+                },
+            })
+            .collect()
+    }
+
+    fn side(
+        decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
+    ) -> Side {
+        Side::start("test", 2, pairs(6), left_of, decode).expect("a thread")
+    }
+
+    #[test]
+    fn a_panic_costs_one_image_and_the_order_stays() {
+        let side = side(|file, image| {
+            assert_ne!(file, Path::new("2"), "a decoder that fails");
+            let number = file.to_string_lossy().parse().expect("a number");
+            image.reshape(1, 1);
+            image.pixels_mut()[0] = number;
+            Ok(())
+        });
+        let seen: Vec<_> = (0..6).map(|_| side.take().map(|i| i.pixels()[0])).collect();
+        assert_eq!(seen[2], Err("2: the decoder failed on it".to_owned()));
+        for (index, answer) in seen.iter().enumerate().filter(|(index, _)| *index != 2) {
+            assert_eq!(*answer, Ok(index as u8));
+        }
+        assert!(side.take().is_err(), "after the end nobody waits");
+    }
+
+    #[test]
+    fn buffers_that_are_given_back_are_filled_again() {
+        let side = side(|_, image| {
+            image.reshape(64, 64);
+            Ok(())
+        });
+        let mut addresses = std::collections::BTreeSet::new();
+        for _ in 0..6 {
+            let image = side.take().expect("an image");
+            addresses.insert(image.pixels().as_ptr() as usize);
+            side.give_back(image);
+        }
+        // Two in the queue, one at each end; without the pool there could be six at once.
+        assert!(addresses.len() <= 5, "{}", addresses.len());
+    }
+
+    #[test]
+    fn one_that_is_dropped_early_ends_its_thread() {
+        let (ended, end) = bounded::<()>(0);
+        let side = side(move |_, _| {
+            // Disconnected when the closure is dropped, that is when the thread is over.
+            let _ = &ended;
+            Ok(())
+        });
+        drop(side.take());
+        drop(side);
+        assert_eq!(
+            end.try_recv(),
+            Err(crossbeam_channel::TryRecvError::Disconnected)
+        );
+    }
+}

@@ -1,0 +1,139 @@
+//! Small text files in; lines, numbers and stamps out, with file and line of what is wrong.
+
+use super::dataset::DatasetError;
+use std::path::Path;
+
+/// Longest text file that is read, bytes: stamps of millions of frames.
+const MAX_BYTES: u64 = 256 << 20;
+
+/// Reads a text file.
+pub(super) fn read(file: &Path) -> Result<String, DatasetError> {
+    let unreadable = |e: std::io::Error| DatasetError::file(file, format!("cannot be read: {e}"));
+    let meta = std::fs::metadata(file).map_err(unreadable)?;
+    if !meta.is_file() {
+        return Err(DatasetError::file(file, "is not a file"));
+    }
+    if meta.len() > MAX_BYTES {
+        return Err(DatasetError::file(
+            file,
+            format!("has {} bytes, more than {MAX_BYTES}", meta.len()),
+        ));
+    }
+    let bytes = std::fs::read(file).map_err(unreadable)?;
+    String::from_utf8(bytes).map_err(|e| {
+        let before = &e.as_bytes()[..e.utf8_error().valid_up_to()];
+        let line = 1 + before.iter().filter(|&&b| b == b'\n').count();
+        DatasetError::line(file, line, "is not UTF-8 text")
+    })
+}
+
+/// The lines that say something, with their numbers from 1: no blank ones, no `#` comments.
+pub(super) fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
+    text.lines()
+        .enumerate()
+        .map(|(index, line)| (index + 1, line.trim()))
+        .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
+}
+
+/// The stamps of a file with one time in seconds a line, ns, strictly rising.
+pub(super) fn times_ns(file: &Path) -> Result<Vec<i64>, DatasetError> {
+    let text = read(file)?;
+    let mut times: Vec<i64> = Vec::new();
+    for (line, word) in lines(&text) {
+        let time = ns_from_seconds(word).ok_or_else(|| {
+            DatasetError::line(
+                file,
+                line,
+                format!(
+                    "a time in seconds was expected, but it reads \"{}\"",
+                    shown(word)
+                ),
+            )
+        })?;
+        if times.last().is_some_and(|&last| time <= last) {
+            return Err(DatasetError::line(
+                file,
+                line,
+                format!("the time {} does not lie after the one before", shown(word)),
+            ));
+        }
+        times.push(time);
+    }
+    Ok(times)
+}
+
+/// Seconds as nanoseconds, to the last digit where they are written without an exponent.
+pub(super) fn ns_from_seconds(word: &str) -> Option<i64> {
+    let (sign, digits) = match word.strip_prefix('-') {
+        Some(rest) => (-1, rest),
+        None => (1, word.strip_prefix('+').unwrap_or(word)),
+    };
+    let (whole, fraction) = digits.split_once('.').unwrap_or((digits, ""));
+    let plain = |part: &str| part.bytes().all(|b| b.is_ascii_digit());
+    if plain(whole) && plain(fraction) && !whole.is_empty() {
+        // Ten digits of the fraction: nine and the one that rounds.
+        let mut tenths_of_ns = 0_i64;
+        for place in 0..10 {
+            let digit = fraction.as_bytes().get(place).map_or(0, |b| b - b'0');
+            tenths_of_ns = tenths_of_ns * 10 + i64::from(digit);
+        }
+        let whole_ns = whole.parse::<i64>().ok()?.checked_mul(1_000_000_000)?;
+        return whole_ns
+            .checked_add((tenths_of_ns + 5) / 10)
+            .map(|ns| sign * ns);
+    }
+    let ns = (word.parse::<f64>().ok()? * 1e9).round();
+    // Up to 2^62 ns, about 146 years, so that differences fit as well.
+    (ns.abs() < (1_i64 << 62) as f64).then_some(ns as i64)
+}
+
+/// A word from a file as it may be shown in a message: short, on one line.
+pub(super) fn shown(word: &str) -> String {
+    const LONGEST: usize = 40;
+    let mut shown: String = word
+        .chars()
+        .take(LONGEST)
+        .map(|c| if c.is_control() { '\u{FFFD}' } else { c })
+        .collect();
+    if word.chars().nth(LONGEST).is_some() {
+        shown.push('…');
+    }
+    shown
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn plain_seconds_keep_every_nanosecond() {
+        for (word, ns) in [
+            ("1403715273.262142976", 1_403_715_273_262_142_976),
+            ("0", 0),
+            ("0.1", 100_000_000),
+            ("-1.5", -1_500_000_000),
+            ("2.0000000005", 2_000_000_001),
+            ("1.036224e-01", 103_622_400),
+            ("5.", 5_000_000_000),
+        ] {
+            assert_eq!(ns_from_seconds(word), Some(ns), "{word}");
+        }
+    }
+
+    #[test]
+    fn what_is_no_time_is_refused() {
+        for word in [
+            "",
+            ".",
+            "nan",
+            "inf",
+            "1e300",
+            "12:30",
+            "1 2",
+            "99999999999999999999",
+            "9300000000",
+        ] {
+            assert_eq!(ns_from_seconds(word), None, "{word}");
+        }
+    }
+}
