@@ -1,1 +1,101 @@
 //! Configuration: what was typed in, a checked one out.
+//!
+//! One table a stage; each stage's own `Settings` hold its defaults, ranges and reasons. Unknown
+//! keys are refused, and a value out of range is named with file, line and key.
+
+use crate::settings::SettingError;
+use crate::toml_file::{TomlError, TomlText};
+use crate::{capture, estimation, features, matching, output, pipeline};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// All settings.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Config {
+    /// The rig file; relative to the configuration's own folder. Default: the recording's own.
+    pub rig: Option<PathBuf>,
+    /// How recordings are read.
+    pub dataset: capture::dataset::Settings,
+    /// How features are found.
+    pub features: features::Settings,
+    /// How features are matched.
+    pub matching: matching::Settings,
+    /// How motion is estimated.
+    pub estimation: estimation::Settings,
+    /// How the work is spread over threads.
+    pub pipeline: pipeline::Settings,
+    /// Where the results are published.
+    pub publish: output::publication::Settings,
+}
+
+impl Config {
+    /// Reads a configuration file; what it does not mention keeps its default.
+    ///
+    /// # Errors
+    /// The file cannot be read, is not TOML, has an unknown key, or a value of the wrong type or out
+    /// of range.
+    pub fn load(path: &Path) -> Result<Self, TomlError> {
+        let mut config = Self::from_text(&TomlText::read(path)?)?;
+        if let (Some(rig), Some(folder)) = (&mut config.rig, path.parent()) {
+            *rig = folder.join(&*rig);
+        }
+        Ok(config)
+    }
+
+    /// Reads a configuration from a text.
+    ///
+    /// # Errors
+    /// As [`load`](Self::load).
+    pub fn parse(text: &str) -> Result<Self, TomlError> {
+        Self::from_text(&TomlText::new("configuration", text))
+    }
+
+    fn from_text(text: &TomlText) -> Result<Self, TomlError> {
+        let config: Self = text.parse()?;
+        for (table, checked) in [
+            ("dataset", config.dataset.check()),
+            ("features", config.features.check()),
+            ("matching", config.matching.check()),
+            ("estimation", config.estimation.check()),
+            ("pipeline", config.pipeline.check()),
+            ("publish", config.publish.check()),
+        ] {
+            checked.map_err(|SettingError { key, cause }| {
+                text.wrong(&format!("{table}.{key}"), cause)
+            })?;
+        }
+        Ok(config)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn error_of(text: &str) -> String {
+        Config::parse(text).expect_err("must be refused").to_string()
+    }
+
+    #[test]
+    fn an_empty_configuration_is_the_default() {
+        assert_eq!(Config::parse("").expect("valid"), Config::default());
+    }
+
+    #[test]
+    fn mistakes_are_named_with_line_and_key() {
+        let unknown = error_of("[estimation]\nmethd = \"svd\"\n");
+        assert!(
+            unknown.starts_with("configuration:2: estimation.methd: unknown field `methd`"),
+            "{unknown}"
+        );
+        assert_eq!(
+            error_of("[matching]\n\nmax_ratio = 7.0\n"),
+            "configuration:3: matching.max_ratio: must be from 0.1 to 1, but is 7"
+        );
+        let nan = error_of("[estimation]\ngate_sigma2 = nan\n");
+        assert!(nan.contains("estimation.gate_sigma2: must be from 1 to 100"), "{nan}");
+        let method = error_of("estimation = { method = \"magic\" }");
+        assert!(method.contains("estimation.method: unknown variant `magic`"), "{method}");
+    }
+}

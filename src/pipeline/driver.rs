@@ -1,0 +1,388 @@
+//! The threads: a source of pairs in, odometry rows out, in order.
+//!
+//! ```text
+//! source ─ feeder ─┬─ feature worker 1 ─┬─ method (the caller's thread) ─ deliver
+//!                  └─ feature worker n ─┘
+//! ```
+//!
+//! Workers take images, left and right alike, as they come; rows leave in the order of the pairs,
+//! and what is in them does not depend on how many workers there are. A fixed number of pairs is
+//! under way at once: their buffers go round, so that nothing is allocated after the first few.
+
+use super::method::{DescribedPair, Method};
+use crate::capture::{PairEvent, PairSource, Side, StereoPair, Unusable};
+use crate::estimation::{Odometry, PairStamp};
+use crate::features::{Extractor, Features};
+use crate::image::GrayImage;
+use crate::settings::SettingError;
+use crossbeam_channel::{Receiver, Sender, bounded};
+use serde::{Deserialize, Serialize};
+use std::collections::VecDeque;
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
+
+/// How the work is spread over threads.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Settings {
+    /// Threads that find features. 0 to 64, default 0: as many as the machine has processors. The
+    /// results do not depend on it.
+    pub workers: usize,
+}
+
+impl Settings {
+    /// Refuses values out of range.
+    ///
+    /// # Errors
+    /// The first setting out of range.
+    pub fn check(&self) -> Result<(), SettingError> {
+        SettingError::unless_in("workers", self.workers, 0..=64)
+    }
+
+    /// The number of feature workers on this machine.
+    #[must_use]
+    pub fn worker_count(&self) -> usize {
+        if self.workers > 0 {
+            return self.workers;
+        }
+        std::thread::available_parallelism().map_or(2, std::num::NonZero::get)
+    }
+}
+
+/// How long one pair took, stage by stage.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct StageLatencies {
+    /// The slower image's detection and description.
+    pub features: Duration,
+    /// Left–right and over time.
+    pub matching: Duration,
+    /// Triangulation to pose.
+    pub estimation: Duration,
+    /// From the pair's arrival to its row.
+    pub total: Duration,
+}
+
+/// One pair's row, ready to be published.
+#[derive(Debug)]
+pub struct Delivery<'a> {
+    /// The estimate.
+    pub odometry: &'a Odometry,
+    /// How long it took; zero for a pair that was not usable.
+    pub latencies: StageLatencies,
+    /// Why the pair was not usable, where it was not.
+    pub unusable: Option<&'a str>,
+}
+
+/// Why a run ended early.
+#[derive(Debug, thiserror::Error)]
+pub enum PipelineError<E> {
+    /// The receiver of rows gave up.
+    #[error("{0}")]
+    Deliver(E),
+    /// A thread could not be started.
+    #[error("a thread cannot be started: {0}")]
+    Thread(std::io::Error),
+    /// A thread ended before its work did.
+    #[error("a feature worker ended unexpectedly: this is a fault of the program")]
+    Worker,
+}
+
+/// Pairs under way at once, beyond one a worker.
+const SLACK_PAIRS: usize = 2;
+
+/// Carries every pair of `source` through `method` and hands each row to `deliver`, in order,
+/// until the source ends or `deliver` breaks off. No pair is dropped.
+///
+/// `extractors` holds one for each feature worker, all alike.
+///
+/// # Errors
+/// What `deliver` failed with, or the system's refusal of a thread.
+pub fn run<S: PairSource, E>(
+    source: S,
+    extractors: Vec<Box<dyn Extractor>>,
+    method: &mut Method,
+    mut deliver: impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
+) -> Result<(), PipelineError<E>> {
+    let under_way = extractors.len() + SLACK_PAIRS;
+    let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
+    let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);
+    let (spare_in, spare) = bounded::<Spare>(under_way);
+    for _ in 0..under_way {
+        // The queue has room for exactly these.
+        let _ = spare_in.send(Spare::default());
+    }
+    std::thread::scope(|scope| {
+        for (n, extractor) in extractors.into_iter().enumerate() {
+            let (jobs, done) = (jobs.clone(), done_in.clone());
+            std::thread::Builder::new()
+                .name(format!("features-{n}"))
+                .spawn_scoped(scope, move || work(extractor, &jobs, &done))
+                .map_err(PipelineError::Thread)?;
+        }
+        std::thread::Builder::new()
+            .name("feeder".to_owned())
+            .spawn_scoped(scope, move || feed(source, &spare, &jobs_in, &done_in))
+            .map_err(PipelineError::Thread)?;
+        // Whatever ends this loop drops its ends of the queues, which ends the threads.
+        drop(jobs);
+        collect(&done, spare_in, method, &mut deliver)
+    })
+}
+
+/// Buffers that go round.
+#[derive(Default)]
+struct Spare {
+    used: Option<StereoPair>,
+    left: Features,
+    right: Features,
+}
+
+/// One image to find features in.
+struct Job {
+    ticket: u64,
+    stamp: PairStamp,
+    arrived: Instant,
+    side: Side,
+    image: GrayImage,
+    features: Features,
+}
+
+/// What comes back: tickets count the source's events.
+enum Done {
+    Side {
+        job: Job,
+        took: Duration,
+        failed: Option<String>,
+    },
+    Unusable {
+        ticket: u64,
+        unusable: Unusable,
+        buffers: Spare,
+    },
+    WorkerDied,
+}
+
+/// Reads the source as fast as buffers come back.
+fn feed<S: PairSource>(
+    mut source: S,
+    spare: &Receiver<Spare>,
+    jobs: &Sender<Job>,
+    done: &Sender<Done>,
+) {
+    let mut ticket = 0;
+    while let Ok(mut buffers) = spare.recv() {
+        if let Some(pair) = buffers.used.take() {
+            source.recycle(pair);
+        }
+        let sent = match source.next_event() {
+            None => return,
+            Some(PairEvent::Unusable(unusable)) => done
+                .send(Done::Unusable {
+                    ticket,
+                    unusable,
+                    buffers,
+                })
+                .is_ok(),
+            Some(PairEvent::Pair(pair)) => {
+                let arrived = Instant::now();
+                let stamp = PairStamp {
+                    sequence: pair.sequence,
+                    timestamp_ns: pair.timestamp_ns,
+                };
+                let job = |side, image, features| Job {
+                    ticket,
+                    stamp,
+                    arrived,
+                    side,
+                    image,
+                    features,
+                };
+                let left = job(Side::Left, pair.left, buffers.left);
+                let right = job(Side::Right, pair.right, buffers.right);
+                jobs.send(left).is_ok() && jobs.send(right).is_ok()
+            }
+        };
+        if !sent {
+            return;
+        }
+        ticket += 1;
+    }
+}
+
+/// Finds features until there are no more images.
+fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<Done>) {
+    /// Tells the collector if the worker dies, so that it does not wait for ever.
+    struct Alarm<'a>(&'a Sender<Done>);
+    impl Drop for Alarm<'_> {
+        fn drop(&mut self) {
+            if std::thread::panicking() {
+                let _ = self.0.send(Done::WorkerDied);
+            }
+        }
+    }
+    let _alarm = Alarm(done);
+    while let Ok(mut job) = jobs.recv() {
+        let started = Instant::now();
+        let result = extractor.extract(&job.image, &mut job.features);
+        let side = Done::Side {
+            took: started.elapsed(),
+            failed: result.err().map(|e| e.to_string()),
+            job,
+        };
+        if done.send(side).is_err() {
+            return;
+        }
+    }
+}
+
+/// One event on its way, complete once both sides are there.
+enum Pending {
+    Waiting,
+    Half(Half),
+    Pair {
+        left: Half,
+        right: Half,
+    },
+    Unusable {
+        unusable: Unusable,
+        buffers: Spare,
+    },
+}
+
+/// One described image.
+struct Half {
+    job: Job,
+    took: Duration,
+    failed: Option<String>,
+}
+
+/// Puts events back in order and steps the method through them.
+fn collect<E>(
+    done: &Receiver<Done>,
+    spare: Sender<Spare>,
+    method: &mut Method,
+    deliver: &mut impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
+) -> Result<(), PipelineError<E>> {
+    let mut pending: VecDeque<Pending> = VecDeque::new();
+    let mut first_ticket = 0;
+    let mut described = DescribedPair::default();
+    let mut slot = |pending: &mut VecDeque<Pending>, first: u64, ticket: u64| -> usize {
+        let at = (ticket - first) as usize;
+        while pending.len() <= at {
+            pending.push_back(Pending::Waiting);
+        }
+        at
+    };
+    while let Ok(message) = done.recv() {
+        match message {
+            Done::WorkerDied => return Err(PipelineError::Worker),
+            Done::Unusable {
+                ticket,
+                unusable,
+                buffers,
+            } => {
+                let at = slot(&mut pending, first_ticket, ticket);
+                pending[at] = Pending::Unusable { unusable, buffers };
+            }
+            Done::Side { job, took, failed } => {
+                let at = slot(&mut pending, first_ticket, job.ticket);
+                let half = Half { job, took, failed };
+                pending[at] = match std::mem::replace(&mut pending[at], Pending::Waiting) {
+                    Pending::Half(other) if other.job.side == Side::Left => Pending::Pair {
+                        left: other,
+                        right: half,
+                    },
+                    Pending::Half(other) => Pending::Pair {
+                        left: half,
+                        right: other,
+                    },
+                    _ => Pending::Half(half),
+                };
+            }
+        }
+        while let Some(Pending::Pair { .. } | Pending::Unusable { .. }) = pending.front() {
+            let Some(event) = pending.pop_front() else {
+                break;
+            };
+            first_ticket += 1;
+            let (buffers, flow) = step(event, method, &mut described, deliver)?;
+            if flow.is_break() {
+                return Ok(());
+            }
+            // The feeder may be gone already, having read the source to its end.
+            let _ = spare.send(buffers);
+        }
+    }
+    Ok(())
+}
+
+/// Takes one event through the method; gives its buffers back.
+fn step<E>(
+    event: Pending,
+    method: &mut Method,
+    described: &mut DescribedPair,
+    deliver: &mut impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
+) -> Result<(Spare, ControlFlow<()>), PipelineError<E>> {
+    let skip = |method: &mut Method, stamp, why: &str, deliver: &mut dyn FnMut(Delivery<'_>) -> _| {
+        let odometry = method.skip(stamp);
+        deliver(Delivery {
+            odometry: &odometry,
+            latencies: StageLatencies::default(),
+            unusable: Some(why),
+        })
+        .map_err(PipelineError::Deliver)
+    };
+    match event {
+        Pending::Waiting | Pending::Half(_) => Ok((Spare::default(), ControlFlow::Continue(()))),
+        Pending::Unusable { unusable, buffers } => {
+            let stamp = PairStamp {
+                sequence: unusable.sequence,
+                timestamp_ns: unusable
+                    .timestamp_ns
+                    .unwrap_or(described.timestamp_ns),
+            };
+            let flow = skip(method, stamp, &unusable.why, deliver)?;
+            Ok((buffers, flow))
+        }
+        Pending::Pair { left, right } => {
+            let stamp = left.job.stamp;
+            let arrived = left.job.arrived;
+            let features = left.took.max(right.took);
+            let failed = left.failed.or(right.failed);
+            *described = DescribedPair {
+                sequence: stamp.sequence,
+                timestamp_ns: stamp.timestamp_ns,
+                left: left.job.features,
+                right: right.job.features,
+            };
+            let flow = if let Some(why) = failed {
+                skip(method, stamp, &why, deliver)?
+            } else {
+                let odometry = method.step(described);
+                let times = method.times();
+                deliver(Delivery {
+                    odometry: &odometry,
+                    latencies: StageLatencies {
+                        features,
+                        matching: times.matching,
+                        estimation: times.estimation,
+                        total: arrived.elapsed(),
+                    },
+                    unusable: None,
+                })
+                .map_err(PipelineError::Deliver)?
+            };
+            let spare = Spare {
+                used: Some(StereoPair {
+                    sequence: stamp.sequence,
+                    timestamp_ns: stamp.timestamp_ns,
+                    left: left.job.image,
+                    right: right.job.image,
+                }),
+                left: std::mem::take(&mut described.left),
+                right: std::mem::take(&mut described.right),
+            };
+            Ok((spare, flow))
+        }
+    }
+}
