@@ -1,1 +1,28 @@
 //! Output: odometry in, shared memory, files and reports out.
+//!
+//! | module | writes |
+//! |---|---|
+//! | [`message`], [`health`] | the fixed layouts that go through shared memory |
+//! | [`mounting`] | odometry of the camera as odometry of the robot's base |
+//! | `publisher`, `subscriber` (feature `ipc`) | those layouts to and from iceoryx2 services |
+//! | [`row`], [`csv`], [`json`] | one odometry estimate as a row or an object, number for number the same text |
+//! | [`tum`] | the trajectory for other tools |
+
+pub mod csv;
+pub mod health;
+#[cfg(feature = "ipc")]
+mod ipc;
+pub mod json;
+pub mod message;
+pub mod mounting;
+pub mod number;
+pub mod publication;
+#[cfg(feature = "ipc")]
+pub mod publisher;
+pub mod row;
+#[cfg(feature = "ipc")]
+pub mod subscriber;
+pub mod tum;
+
+#[cfg(feature = "ipc")]
+pub use ipc::IpcError;
