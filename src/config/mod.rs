@@ -74,7 +74,9 @@ mod tests {
     use super::*;
 
     fn error_of(text: &str) -> String {
-        Config::parse(text).expect_err("must be refused").to_string()
+        Config::parse(text)
+            .expect_err("must be refused")
+            .to_string()
     }
 
     #[test]
@@ -94,8 +96,14 @@ mod tests {
             "configuration:3: matching.max_ratio: must be from 0.1 to 1, but is 7"
         );
         let nan = error_of("[estimation]\ngate_sigma2 = nan\n");
-        assert!(nan.contains("estimation.gate_sigma2: must be from 1 to 100"), "{nan}");
+        assert!(
+            nan.contains("estimation.gate_sigma2: must be from 1 to 100"),
+            "{nan}"
+        );
         let method = error_of("estimation = { method = \"magic\" }");
-        assert!(method.contains("estimation.method: unknown variant `magic`"), "{method}");
+        assert!(
+            method.contains("estimation.method: unknown variant `magic`"),
+            "{method}"
+        );
     }
 }

@@ -88,7 +88,7 @@ impl Camera {
     #[must_use]
     pub fn unproject(&self, pixel: &Vector2<f64>) -> Option<Vector2<f64>> {
         let distorted = (pixel - self.principal_point_px).component_div(&self.focal_px);
-        self.distortion.undistort(&distorted)
+        self.distortion.undistort(&distorted, self.max_radius)
     }
 
     /// [`unproject`](Self::unproject) with the derivative of the position by the pixel, 1/px.

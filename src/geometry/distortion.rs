@@ -34,16 +34,17 @@ impl Distortion {
         }
     }
 
-    /// The position whose distorted image is `distorted`; `None` where the model has no inverse.
+    /// The position whose distorted image is `distorted`, within `max_radius` (see
+    /// [`max_radius`](Self::max_radius)); `None` where the model has no inverse.
     ///
     /// Newton's method with step halving, down to rounding.
     #[must_use]
-    pub fn undistort(&self, distorted: &Vector2<f64>) -> Option<Vector2<f64>> {
+    pub fn undistort(&self, distorted: &Vector2<f64>, max_radius: f64) -> Option<Vector2<f64>> {
         if matches!(self, Self::None) {
             return Some(*distorted);
         }
         let mut p = self.undistort_guess(distorted)?;
-        let (mut image, mut jacobian) = self.distort_with_jacobian(&p);
+        let (image, mut jacobian) = self.distort_with_jacobian(&p);
         let mut gap = distorted - image;
         for _ in 0..MAX_STEPS {
             if gap.norm() <= 1e-15 * (1.0 + distorted.norm()) {
@@ -55,23 +56,17 @@ impl Distortion {
                 let (next_image, next_jacobian) = self.distort_with_jacobian(&next);
                 let next_gap = distorted - next_image;
                 if next_gap.norm() < gap.norm() {
-                    (p, image, jacobian, gap) = (next, next_image, next_jacobian, next_gap);
+                    (p, jacobian, gap) = (next, next_jacobian, next_gap);
                     break;
                 }
                 step *= 0.5;
                 if step.norm() <= 1e-16 * (1.0 + p.norm()) {
                     // No step comes nearer: this is the answer, if it is one.
-                    return self.accept(p, gap.norm());
+                    return accept(p, gap.norm(), max_radius);
                 }
             }
         }
-        let _ = image;
-        self.accept(p, gap.norm())
-    }
-
-    /// A solution is one only if it reproduces the input on the branch that contains the axis.
-    fn accept(&self, p: Vector2<f64>, gap: f64) -> Option<Vector2<f64>> {
-        (gap < 1e-10 && p.norm() <= self.max_radius()).then_some(p)
+        accept(p, gap.norm(), max_radius)
     }
 
     fn undistort_guess(&self, distorted: &Vector2<f64>) -> Option<Vector2<f64>> {
@@ -137,6 +132,11 @@ impl Distortion {
             }
         }
     }
+}
+
+/// A solution is one only if it reproduces the input on the branch that contains the axis.
+fn accept(p: Vector2<f64>, gap: f64, max_radius: f64) -> Option<Vector2<f64>> {
+    (gap < 1e-10 && p.norm() <= max_radius).then_some(p)
 }
 
 fn radtan(k: &[f64; 8], p: &Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {

@@ -239,14 +239,8 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
 enum Pending {
     Waiting,
     Half(Half),
-    Pair {
-        left: Half,
-        right: Half,
-    },
-    Unusable {
-        unusable: Unusable,
-        buffers: Spare,
-    },
+    Pair { left: Half, right: Half },
+    Unusable { unusable: Unusable, buffers: Spare },
 }
 
 /// One described image.
@@ -266,7 +260,7 @@ fn collect<E>(
     let mut pending: VecDeque<Pending> = VecDeque::new();
     let mut first_ticket = 0;
     let mut described = DescribedPair::default();
-    let mut slot = |pending: &mut VecDeque<Pending>, first: u64, ticket: u64| -> usize {
+    let slot = |pending: &mut VecDeque<Pending>, first: u64, ticket: u64| -> usize {
         let at = (ticket - first) as usize;
         while pending.len() <= at {
             pending.push_back(Pending::Waiting);
@@ -301,88 +295,88 @@ fn collect<E>(
             }
         }
         while let Some(Pending::Pair { .. } | Pending::Unusable { .. }) = pending.front() {
-            let Some(event) = pending.pop_front() else {
-                break;
-            };
+            let event = pending.pop_front();
             first_ticket += 1;
-            let (buffers, flow) = step(event, method, &mut described, deliver)?;
-            if flow.is_break() {
+            let Some(outcome) = event.and_then(|event| step(event, method, &mut described)) else {
+                continue;
+            };
+            let delivery = Delivery {
+                odometry: &outcome.odometry,
+                latencies: outcome.latencies,
+                unusable: outcome.unusable.as_deref(),
+            };
+            if deliver(delivery)
+                .map_err(PipelineError::Deliver)?
+                .is_break()
+            {
                 return Ok(());
             }
             // The feeder may be gone already, having read the source to its end.
-            let _ = spare.send(buffers);
+            let _ = spare.send(outcome.buffers);
         }
     }
     Ok(())
 }
 
-/// Takes one event through the method; gives its buffers back.
-fn step<E>(
-    event: Pending,
-    method: &mut Method,
-    described: &mut DescribedPair,
-    deliver: &mut impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
-) -> Result<(Spare, ControlFlow<()>), PipelineError<E>> {
-    let skip = |method: &mut Method, stamp, why: &str, deliver: &mut dyn FnMut(Delivery<'_>) -> _| {
-        let odometry = method.skip(stamp);
-        deliver(Delivery {
-            odometry: &odometry,
-            latencies: StageLatencies::default(),
-            unusable: Some(why),
-        })
-        .map_err(PipelineError::Deliver)
-    };
+/// What one event came to, and its buffers.
+struct Outcome {
+    odometry: Odometry,
+    latencies: StageLatencies,
+    unusable: Option<String>,
+    buffers: Spare,
+}
+
+/// Takes one complete event through the method. `described` only lends its memory.
+fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> Option<Outcome> {
     match event {
-        Pending::Waiting | Pending::Half(_) => Ok((Spare::default(), ControlFlow::Continue(()))),
+        Pending::Waiting | Pending::Half(_) => None,
         Pending::Unusable { unusable, buffers } => {
             let stamp = PairStamp {
                 sequence: unusable.sequence,
-                timestamp_ns: unusable
-                    .timestamp_ns
-                    .unwrap_or(described.timestamp_ns),
+                timestamp_ns: unusable.timestamp_ns.unwrap_or(described.timestamp_ns),
             };
-            let flow = skip(method, stamp, &unusable.why, deliver)?;
-            Ok((buffers, flow))
+            Some(Outcome {
+                odometry: method.skip(stamp),
+                latencies: StageLatencies::default(),
+                unusable: Some(unusable.why),
+                buffers,
+            })
         }
         Pending::Pair { left, right } => {
             let stamp = left.job.stamp;
-            let arrived = left.job.arrived;
-            let features = left.took.max(right.took);
-            let failed = left.failed.or(right.failed);
             *described = DescribedPair {
                 sequence: stamp.sequence,
                 timestamp_ns: stamp.timestamp_ns,
                 left: left.job.features,
                 right: right.job.features,
             };
-            let flow = if let Some(why) = failed {
-                skip(method, stamp, &why, deliver)?
+            let unusable = left.failed.or(right.failed);
+            let odometry = if unusable.is_some() {
+                method.skip(stamp)
             } else {
-                let odometry = method.step(described);
-                let times = method.times();
-                deliver(Delivery {
-                    odometry: &odometry,
-                    latencies: StageLatencies {
-                        features,
-                        matching: times.matching,
-                        estimation: times.estimation,
-                        total: arrived.elapsed(),
-                    },
-                    unusable: None,
-                })
-                .map_err(PipelineError::Deliver)?
+                method.step(described)
             };
-            let spare = Spare {
-                used: Some(StereoPair {
-                    sequence: stamp.sequence,
-                    timestamp_ns: stamp.timestamp_ns,
-                    left: left.job.image,
-                    right: right.job.image,
-                }),
-                left: std::mem::take(&mut described.left),
-                right: std::mem::take(&mut described.right),
-            };
-            Ok((spare, flow))
+            let times = method.times();
+            Some(Outcome {
+                odometry,
+                latencies: StageLatencies {
+                    features: left.took.max(right.took),
+                    matching: times.matching,
+                    estimation: times.estimation,
+                    total: left.job.arrived.elapsed(),
+                },
+                unusable,
+                buffers: Spare {
+                    used: Some(StereoPair {
+                        sequence: stamp.sequence,
+                        timestamp_ns: stamp.timestamp_ns,
+                        left: left.job.image,
+                        right: right.job.image,
+                    }),
+                    left: std::mem::take(&mut described.left),
+                    right: std::mem::take(&mut described.right),
+                },
+            })
         }
     }
 }
