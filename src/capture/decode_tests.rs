@@ -14,7 +14,7 @@ fn decode_with(white_level: u16, bytes: &[u8]) -> Result<GrayImage, String> {
     };
     match target.decode(bytes) {
         Ok(()) => Ok(image),
-        Err(fault) => Err(with_name(fault, Path::new("image")).to_string()),
+        Err(fault) => Err(fault.within(Path::new("image")).to_string()),
     }
 }
 

@@ -5,7 +5,9 @@
 
 pub mod dataset;
 pub mod decode;
+mod decode_error;
 mod euroc;
+mod euroc_frames;
 mod jpeg;
 mod kitti;
 mod own;
