@@ -595,18 +595,22 @@ fn names_that_are_not_text_are_paired_like_others() {
 #[test]
 fn settings_out_of_range_are_refused() {
     assert_eq!(Settings::default().check(), Ok(()));
-    let mut settings = Settings::default();
-    settings.read_ahead = 0;
-    assert_eq!(settings.check().expect_err("no queue").key, "read_ahead");
-    let mut settings = Settings::default();
-    settings.pairing_tolerance_s = f64::NAN;
-    assert_eq!(
-        settings.check().expect_err("no number").key,
-        "pairing_tolerance_s"
-    );
-    let mut settings = Settings::default();
-    settings.white_level = 0;
-    assert_eq!(settings.check().expect_err("no range").key, "white_level");
+    let refused = |settings: Settings| settings.check().expect_err("out of range").key;
+    let read_ahead = Settings {
+        read_ahead: 0,
+        ..Settings::default()
+    };
+    assert_eq!(refused(read_ahead), "read_ahead");
+    let tolerance = Settings {
+        pairing_tolerance_s: f64::NAN,
+        ..Settings::default()
+    };
+    assert_eq!(refused(tolerance), "pairing_tolerance_s");
+    let white = Settings {
+        white_level: 0,
+        ..Settings::default()
+    };
+    assert_eq!(refused(white), "white_level");
 }
 
 /// A test recording, where it is there.

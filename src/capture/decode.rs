@@ -1,16 +1,19 @@
 //! Image files in; 8-bit grey images out, or one sentence why not.
 //!
 //! PNG, JPEG, PGM and PPM, 8 or 16 bits a sample, grey or colour; alpha is ignored. Only whole
-//! images come out: a truncated or damaged file is an error, never a picture with a grey end.
+//! images come out: a truncated file is an error, never a picture with a grey end. Damage within a
+//! file is found as far as its format lets one: by checksums in PNG, where the code breaks in JPEG.
 
+use super::decode_error::Fault;
 use super::jpeg;
 use crate::image::GrayImage;
 use image::codecs::{png::PngDecoder, pnm::PnmDecoder};
-use image::{ColorType, ImageDecoder, ImageError, Limits};
-use std::error::Error;
+use image::{ColorType, ImageDecoder, Limits};
 use std::fs::File;
-use std::io::{Cursor, ErrorKind, Read};
-use std::path::{Path, PathBuf};
+use std::io::{Cursor, Read};
+use std::path::Path;
+
+pub use super::decode_error::DecodeError;
 
 /// Longest image side that is decoded, px.
 pub const MAX_SIDE_PX: u32 = 16_384;
@@ -18,112 +21,6 @@ pub const MAX_SIDE_PX: u32 = 16_384;
 pub const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Most memory that the decoded samples of one image may take, bytes.
 const MAX_SAMPLE_BYTES: u64 = 1 << 30;
-
-/// Why a file did not become an image.
-#[derive(Debug, thiserror::Error)]
-pub enum DecodeError {
-    /// The file is missing, or the system refuses to read it.
-    #[error("{}: cannot be read: {cause}", file.display())]
-    Unreadable {
-        /// The file.
-        file: PathBuf,
-        /// What the system says.
-        cause: std::io::Error,
-    },
-    /// The path leads to a folder, a pipe or a device.
-    #[error("{}: is not a file", file.display())]
-    NotAFile {
-        /// The path.
-        file: PathBuf,
-    },
-    /// The file holds nothing.
-    #[error("{}: the file is empty", file.display())]
-    Empty {
-        /// The file.
-        file: PathBuf,
-    },
-    /// The file is longer than any image that is read.
-    #[error("{}: has {bytes} bytes, more than {MAX_FILE_BYTES}", file.display())]
-    FileTooLong {
-        /// The file.
-        file: PathBuf,
-        /// Its length, bytes.
-        bytes: u64,
-    },
-    /// The first bytes are those of no image that is read.
-    #[error("{}: is not a PNG, JPEG, PGM or PPM image", file.display())]
-    UnknownFormat {
-        /// The file.
-        file: PathBuf,
-    },
-    /// The image is larger than any that is decoded.
-    #[error("{}: {width}×{height} px are more than can be decoded", file.display())]
-    TooLarge {
-        /// The file.
-        file: PathBuf,
-        /// Width, px.
-        width: u32,
-        /// Height, px.
-        height: u32,
-    },
-    /// The image is not of the size that was asked for.
-    #[error(
-        "{}: the image has {width}×{height} px, but the rig's {expected_width}×{expected_height}",
-        file.display()
-    )]
-    WrongSize {
-        /// The file.
-        file: PathBuf,
-        /// Width, px.
-        width: u32,
-        /// Height, px.
-        height: u32,
-        /// Width that was asked for, px.
-        expected_width: u32,
-        /// Height that was asked for, px.
-        expected_height: u32,
-    },
-    /// The file ends before the image does.
-    #[error("{}: the file ends before the image does", file.display())]
-    Truncated {
-        /// The file.
-        file: PathBuf,
-    },
-    /// The file's content breaks the rules of its format.
-    #[error("{}: is damaged: {cause}", file.display())]
-    Damaged {
-        /// The file.
-        file: PathBuf,
-        /// What the decoder says.
-        cause: String,
-    },
-}
-
-/// What goes wrong inside a file; the file's name is added where it is known.
-pub(super) enum Fault {
-    Truncated,
-    TooLarge(u32, u32),
-    WrongSize((u32, u32), (u32, u32)),
-    UnknownFormat,
-    Damaged(String),
-}
-
-impl From<ImageError> for Fault {
-    fn from(error: ImageError) -> Self {
-        let is_end = |e: &std::io::Error| e.kind() == ErrorKind::UnexpectedEof;
-        // A decoder hands the end of its input on, or wraps it in an error of its own.
-        let mut wrapped = error.source();
-        let mut ends = matches!(&error, ImageError::IoError(e) if is_end(e));
-        while let Some(inner) = wrapped {
-            ends |= inner.downcast_ref().is_some_and(is_end);
-            wrapped = inner.source();
-        }
-        if ends {
-            return Self::Truncated;
-        }
-        Self::Damaged(error.to_string().replace('\n', " "))
-    }
-}
 
 /// Decodes one file after the other with the same buffers.
 #[derive(Debug)]
@@ -166,8 +63,7 @@ impl Decoder {
         image: &mut GrayImage,
     ) -> Result<(), DecodeError> {
         self.file_bytes.clear();
-        let length = checked_length(file)?;
-        read(file, length, &mut self.file_bytes)?;
+        read(file, &mut self.file_bytes)?;
         let mut target = Target {
             expected_px,
             white_level: self.white_level,
@@ -176,7 +72,7 @@ impl Decoder {
         };
         target
             .decode(&self.file_bytes)
-            .map_err(|fault| with_name(fault, file))
+            .map_err(|fault| fault.within(file))
     }
 
     /// The width and height of the image in `file`, px, from its header.
@@ -185,9 +81,8 @@ impl Decoder {
     /// The file cannot be read or its header makes no sense.
     pub fn size_px(&mut self, file: &Path) -> Result<(u32, u32), DecodeError> {
         self.file_bytes.clear();
-        let length = checked_length(file)?;
-        read(file, length, &mut self.file_bytes)?;
-        header_size_px(&self.file_bytes).map_err(|fault| with_name(fault, file))
+        read(file, &mut self.file_bytes)?;
+        header_size_px(&self.file_bytes).map_err(|fault| fault.within(file))
     }
 }
 
@@ -209,7 +104,8 @@ fn checked_length(file: &Path) -> Result<u64, DecodeError> {
     }
 }
 
-fn read(file: &Path, length: u64, bytes: &mut Vec<u8>) -> Result<(), DecodeError> {
+fn read(file: &Path, bytes: &mut Vec<u8>) -> Result<(), DecodeError> {
+    let length = checked_length(file)?;
     let unreadable = |cause| DecodeError::Unreadable {
         file: file.to_owned(),
         cause,
@@ -222,29 +118,6 @@ fn read(file: &Path, length: u64, bytes: &mut Vec<u8>) -> Result<(), DecodeError
         .read_to_end(bytes)
         .map_err(unreadable)?;
     Ok(())
-}
-
-fn with_name(fault: Fault, file: &Path) -> DecodeError {
-    let file = file.to_owned();
-    match fault {
-        Fault::Truncated => DecodeError::Truncated { file },
-        Fault::UnknownFormat => DecodeError::UnknownFormat { file },
-        Fault::Damaged(cause) => DecodeError::Damaged { file, cause },
-        Fault::TooLarge(width, height) => DecodeError::TooLarge {
-            file,
-            width,
-            height,
-        },
-        Fault::WrongSize((width, height), (expected_width, expected_height)) => {
-            DecodeError::WrongSize {
-                file,
-                width,
-                height,
-                expected_width,
-                expected_height,
-            }
-        }
-    }
 }
 
 enum Format {
@@ -388,15 +261,11 @@ fn grey_from_colour8(samples: &[u8], channels: usize, grey: &mut [u8]) {
     }
 }
 
-/// `share` of `white` as 0 to 255, rounded, never above.
-fn byte_from_share(share: u64, white: u64) -> u8 {
-    u8::try_from((share * 255 + white / 2) / white).unwrap_or(u8::MAX)
-}
-
 fn grey_from_grey16(samples: &[u8], channels: usize, white_level: u16, grey: &mut [u8]) {
+    let white = u32::from(white_level);
     for (pixel, out) in samples.chunks_exact(2 * channels).zip(grey) {
-        let sample = u16::from_ne_bytes([pixel[0], pixel[1]]);
-        *out = byte_from_share(u64::from(sample), u64::from(white_level));
+        let sample = u32::from(u16::from_ne_bytes([pixel[0], pixel[1]]));
+        *out = u8::try_from((sample * 255 + white / 2) / white).unwrap_or(u8::MAX);
     }
 }
 
@@ -404,8 +273,8 @@ fn grey_from_colour16(samples: &[u8], channels: usize, white_level: u16, grey: &
     let white = u64::from(white_level) * 1000;
     for (pixel, out) in samples.chunks_exact(2 * channels).zip(grey) {
         let sample = |at: usize| u32::from(u16::from_ne_bytes([pixel[at], pixel[at + 1]]));
-        let luma = luma_thousandths(sample(0), sample(2), sample(4));
-        *out = byte_from_share(u64::from(luma), white);
+        let luma = u64::from(luma_thousandths(sample(0), sample(2), sample(4)));
+        *out = u8::try_from((luma * 255 + white / 2) / white).unwrap_or(u8::MAX);
     }
 }
 

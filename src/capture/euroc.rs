@@ -1,14 +1,14 @@
 //! The EuRoC (ASL) layout: `mav0/cam0`, `mav0/cam1`, each with `sensor.yaml` and stamped images.
 
-use super::dataset::{DatasetError, ImageFiles, Layout, PairFiles, Parts, Settings};
-use super::own::images_in;
+use super::dataset::{DatasetError, Layout, Parts, Settings};
+use super::euroc_frames::{Frames, paired_by_stamp};
 use super::text;
 use super::yaml::{Node, YamlFile};
 use crate::geometry::{Camera, Distortion, StereoRig};
 use nalgebra::{
     Isometry3, Matrix3, Matrix4, Rotation3, RowVector4, Translation3, UnitQuaternion, Vector2,
 };
-use std::path::{Component, Path, PathBuf};
+use std::path::Path;
 
 /// Farthest that a matrix stated as a rotation may be from one: files with four digits pass.
 const MAX_ROTATION_FAULT: f64 = 1e-3;
@@ -207,146 +207,4 @@ fn body_from_sensor(yaml: &YamlFile) -> Result<Isometry3<f64>, DatasetError> {
         Translation3::from(translation),
         UnitQuaternion::from_rotation_matrix(&nearest),
     ))
-}
-
-/// The stamped images of one camera, stamps strictly rising.
-struct Frames(Vec<(i64, PathBuf)>);
-
-impl Frames {
-    fn read(camera: &Path) -> Result<Self, DatasetError> {
-        let (data, csv) = (camera.join("data"), camera.join("data.csv"));
-        if !data.is_dir() {
-            return Err(DatasetError::file(&data, "the folder of images is missing"));
-        }
-        if csv.try_exists().unwrap_or(true) {
-            Self::from_csv(&csv, &data)
-        } else {
-            Self::from_names(&data)
-        }
-    }
-
-    /// Lines of `stamp in ns,file name`.
-    fn from_csv(csv: &Path, data: &Path) -> Result<Self, DatasetError> {
-        let text = text::read(csv)?;
-        let mut frames: Vec<(i64, PathBuf)> = Vec::new();
-        for (line, row) in text::lines(&text) {
-            let wrong = |cause: String| DatasetError::line(csv, line, cause);
-            let (stamp, name) = row.split_once(',').ok_or_else(|| {
-                wrong("a stamp in ns, a comma and a file name were expected".to_owned())
-            })?;
-            let stamp_ns = stamp_ns(stamp.trim()).ok_or_else(|| {
-                let shown = text::shown(stamp);
-                wrong(format!(
-                    "a stamp in ns was expected, but it reads \"{shown}\""
-                ))
-            })?;
-            let name = name.split(',').next().unwrap_or_default().trim();
-            if !is_plain_name(name) {
-                let shown = text::shown(name);
-                return Err(wrong(format!(
-                    "the name of a file in data/ was expected, but it reads \"{shown}\""
-                )));
-            }
-            if frames.last().is_some_and(|&(last, _)| stamp_ns <= last) {
-                return Err(wrong(format!(
-                    "the stamp {stamp_ns} does not lie after the one before"
-                )));
-            }
-            frames.push((stamp_ns, data.join(name)));
-        }
-        if frames.is_empty() {
-            return Err(DatasetError::file(csv, "lists no image"));
-        }
-        Ok(Self(frames))
-    }
-
-    /// Without a list the file names are the stamps.
-    fn from_names(data: &Path) -> Result<Self, DatasetError> {
-        let mut frames = Vec::new();
-        for file in images_in(data)?.into_values() {
-            let stamp = file.file_stem().and_then(|stem| stamp_ns(stem.to_str()?));
-            let stamp = stamp.ok_or_else(|| {
-                DatasetError::file(&file, "without data.csv the name must be the stamp in ns")
-            })?;
-            frames.push((stamp, file));
-        }
-        frames.sort();
-        if frames.is_empty() {
-            return Err(DatasetError::file(
-                data,
-                "holds no PNG, JPEG, PGM or PPM image",
-            ));
-        }
-        match frames.windows(2).find(|two| two[0].0 == two[1].0) {
-            Some(two) => Err(DatasetError::file(
-                &two[1].1,
-                format!("has the same stamp as {}", two[0].1.display()),
-            )),
-            None => Ok(Self(frames)),
-        }
-    }
-}
-
-/// A stamp within ±2^62 ns, so that differences of two fit as well.
-fn stamp_ns(word: &str) -> Option<i64> {
-    word.parse().ok().filter(|ns: &i64| ns.abs() < 1 << 62)
-}
-
-/// One name that stays in its folder: no separator, no `..`, no root.
-fn is_plain_name(name: &str) -> bool {
-    let mut parts = Path::new(name).components();
-    let single = matches!(
-        (parts.next(), parts.next()),
-        (Some(Component::Normal(_)), None)
-    );
-    single && !name.contains(['/', '\\', '\0'])
-}
-
-/// Pairs the images whose stamps are nearest to each other, both ways, within the tolerance.
-fn paired_by_stamp(left: &Frames, right: &Frames, tolerance_ns: i64) -> Vec<PairFiles> {
-    let apart_ns = |l: usize, r: usize| match (left.0.get(l), right.0.get(r)) {
-        (Some((left_ns, _)), Some((right_ns, _))) => (left_ns - right_ns).abs(),
-        _ => i64::MAX,
-    };
-    let stamp_ns = |frames: &Frames, at: usize| frames.0.get(at).map_or(i64::MAX, |frame| frame.0);
-    let (mut l, mut r) = (0, 0);
-    let mut pairs = Vec::with_capacity(left.0.len());
-    while l < left.0.len() || r < right.0.len() {
-        let apart = apart_ns(l, r);
-        if apart <= tolerance_ns && apart <= apart_ns(l + 1, r) && apart <= apart_ns(l, r + 1) {
-            pairs.push(both(&left.0[l], &right.0[r]));
-            l += 1;
-            r += 1;
-        } else if stamp_ns(left, l) < stamp_ns(right, r) {
-            pairs.push(alone(&left.0[l], "right", tolerance_ns));
-            l += 1;
-        } else {
-            pairs.push(alone(&right.0[r], "left", tolerance_ns));
-            r += 1;
-        }
-    }
-    pairs
-}
-
-fn both(left: &(i64, PathBuf), right: &(i64, PathBuf)) -> PairFiles {
-    PairFiles {
-        timestamp_ns: left.0,
-        images: ImageFiles::Both {
-            left: left.1.clone(),
-            right: right.1.clone(),
-        },
-    }
-}
-
-fn alone((timestamp_ns, file): &(i64, PathBuf), other: &str, tolerance_ns: i64) -> PairFiles {
-    PairFiles {
-        timestamp_ns: *timestamp_ns,
-        images: ImageFiles::Unpaired {
-            why: format!(
-                "{}: has no {other} image within {} ms",
-                file.display(),
-                tolerance_ns as f64 * 1e-6
-            ),
-        },
-    }
 }

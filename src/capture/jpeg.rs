@@ -1,6 +1,6 @@
 //! JPEG bytes in; grey (or, for a file that stores RGB, colour) samples out, whole or not at all.
 
-use super::decode::Fault;
+use super::decode_error::Fault;
 use zune_jpeg::errors::DecodeErrors;
 use zune_jpeg::zune_core::{bytestream::ZCursor, colorspace::ColorSpace, options::DecoderOptions};
 

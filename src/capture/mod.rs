@@ -5,7 +5,9 @@
 
 pub mod dataset;
 pub mod decode;
+mod decode_error;
 mod euroc;
+mod euroc_frames;
 mod jpeg;
 mod kitti;
 mod own;
@@ -30,7 +32,7 @@ pub enum Side {
 }
 
 /// Two images taken at the same instant, raw: neither undistorted nor rectified.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub struct StereoPair {
     /// The number of the pair in its recording, counted from 0, unusable pairs included.
     pub sequence: u64,
@@ -54,7 +56,7 @@ pub struct Unusable {
 }
 
 /// What a source hands out.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq, Eq)]
 pub enum PairEvent {
     /// A pair, ready for the stages.
     Pair(StereoPair),

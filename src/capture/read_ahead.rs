@@ -23,8 +23,8 @@ type Decoded = Result<GrayImage, String>;
 pub struct ReadAhead {
     pairs: Arc<[PairFiles]>,
     next: usize,
-    left: Side,
-    right: Side,
+    left: SideReader,
+    right: SideReader,
 }
 
 impl ReadAhead {
@@ -37,7 +37,7 @@ impl ReadAhead {
         let side =
             |name: &str, width: u32, height: u32, pick: fn(&ImageFiles) -> Option<&PathBuf>| {
                 let mut decoder = Decoder::new(dataset.settings.white_level);
-                Side::start(
+                SideReader::start(
                     name,
                     dataset.settings.read_ahead,
                     Arc::clone(&pairs),
@@ -120,14 +120,14 @@ impl PairSource for ReadAhead {
 
 /// The thread that decodes one camera's images, seen from the consumer.
 #[derive(Debug)]
-struct Side {
+struct SideReader {
     /// `None` once the side is being dropped, which is what stops the thread.
     decoded: Option<Receiver<Decoded>>,
     spare: Sender<GrayImage>,
     thread: Option<JoinHandle<()>>,
 }
 
-impl Side {
+impl SideReader {
     /// `pick` chooses this side's file of a pair; `decode` fills an image from it.
     fn start(
         name: &str,
@@ -187,7 +187,7 @@ fn decode_safely(
     }
 }
 
-impl Drop for Side {
+impl Drop for SideReader {
     fn drop(&mut self) {
         self.decoded = None;
         if let Some(thread) = self.thread.take() {
@@ -215,8 +215,8 @@ mod tests {
 
     fn side(
         decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
-    ) -> Side {
-        Side::start("test", 2, pairs(6), left_of, decode).expect("a thread")
+    ) -> SideReader {
+        SideReader::start("test", 2, pairs(6), left_of, decode).expect("a thread")
     }
 
     #[test]

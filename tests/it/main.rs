@@ -1,1 +1,6 @@
 //! The integration tests, in one binary.
+
+#[cfg(test)]
+mod frame_source;
+#[cfg(test)]
+mod recordings;
