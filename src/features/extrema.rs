@@ -209,11 +209,10 @@ fn candidates_anywhere(
 /// Whether the sample exceeds its 26 neighbours.
 fn is_highest(near: &Neighbourhood, column: usize) -> bool {
     let value = near[1][1][column];
-    let others = near.iter().flatten().enumerate().all(|(n, row)| {
+    near.iter().flatten().enumerate().all(|(n, row)| {
         let [left, middle, right] = [row[column - 1], row[column], row[column + 1]];
         value > left && value > right && (n == 4 || value > middle)
-    });
-    others
+    })
 }
 
 /// Where the quadratic through the 27 samples has its top: column, row, layer, in samples from the

@@ -144,7 +144,7 @@ fn strongest_sector(xs: &[f32], ys: &[f32]) -> Direction {
         let at = step + WHOLE_STEPS + 1;
         whole[0][at] += x;
         whole[1][at] += y;
-        if degree % SECTOR_STEP_DEG != 0 {
+        if !degree.is_multiple_of(SECTOR_STEP_DEG) {
             open[0][step] += x;
             open[1][step] += y;
         }
