@@ -2,6 +2,15 @@
 //!
 //! Positions are raw image pixels (distorted, unrectified), pixel centres at integers.
 
+mod descriptor;
+mod extrema;
+mod hessian;
+mod integral;
+mod orientation;
+mod pyramid;
+mod spread;
+pub mod surf;
+
 use crate::image::GrayImage;
 
 /// One distinctive point of an image.

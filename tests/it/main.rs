@@ -4,3 +4,4 @@
 mod frame_source;
 #[cfg(test)]
 mod recordings;
+mod features;

@@ -1,0 +1,297 @@
+//! Orientation: the surroundings of a keypoint in, the direction in which they grow lighter out.
+//!
+//! Gradients (Haar wavelets of side 4 s) are taken at the 113 grid points of spacing s within 6 s,
+//! weighted by a Gaussian of 2.5 s. Of all sectors of 60° of gradient directions, one every 5°, the
+//! one with the longest sum of gradients gives the direction (Bay et al., section 4.1).
+
+use super::integral::IntegralImage;
+
+/// Radius of the disc in which gradients are taken, in units of the scale.
+const RADIUS: i32 = 6;
+/// σ of the gradients' weights, in units of the scale.
+const WEIGHT_SIGMA: f64 = 2.5;
+/// Grid points in the disc.
+const POINTS: usize = 113;
+/// Directions apart of the sectors that are tried.
+const SECTOR_STEP_DEG: usize = 5;
+/// Sectors that are tried.
+const SECTORS: usize = 360 / SECTOR_STEP_DEG;
+/// Steps before and after a sector's middle that lie in it whole; of the step before them it has
+/// all but the first degree, being open at ±30°.
+const WHOLE_STEPS: usize = 5;
+
+/// A direction in the image, from the x axis towards the y axis (down).
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Direction {
+    /// Angle, rad in [0, 2π).
+    pub angle_rad: f32,
+    /// Its cosine.
+    pub cos: f32,
+    /// Its sine.
+    pub sin: f32,
+}
+
+impl Direction {
+    /// What upright keypoints have: straight up, as OpenCV's have.
+    pub(super) const UP: Self = Self {
+        angle_rad: 1.5 * std::f32::consts::PI,
+        cos: 0.0,
+        sin: -1.0,
+    };
+
+    fn of(x: f32, y: f32) -> Self {
+        let length = (x * x + y * y).sqrt();
+        if length > 0.0 {
+            Self {
+                angle_rad: angle_rad(x, y),
+                cos: x / length,
+                sin: y / length,
+            }
+        } else {
+            // No gradient anywhere: any direction is as good.
+            Self {
+                angle_rad: 0.0,
+                cos: 1.0,
+                sin: 0.0,
+            }
+        }
+    }
+}
+
+/// Grid points and weights.
+#[derive(Debug)]
+pub(super) struct Compass {
+    points: [(f32, f32, f32); POINTS],
+}
+
+impl Compass {
+    pub(super) fn new() -> Self {
+        let disc = (-RADIUS..=RADIUS)
+            .flat_map(|x| (-RADIUS..=RADIUS).map(move |y| (x, y)))
+            .filter(|(x, y)| x * x + y * y <= RADIUS * RADIUS);
+        let mut points = [(0.0, 0.0, 0.0); POINTS];
+        for (point, (x, y)) in points.iter_mut().zip(disc) {
+            let weight = (-0.5 * f64::from(x * x + y * y) / WEIGHT_SIGMA.powi(2)).exp();
+            *point = (x as f32, y as f32, weight as f32);
+        }
+        Self { points }
+    }
+
+    /// The direction at `(x_px, y_px)` for scale `scale_px`; `None` where no gradient can be taken
+    /// within the image.
+    pub(super) fn direction(
+        &self,
+        integral: &IntegralImage,
+        (x_px, y_px): (f32, f32),
+        scale_px: f32,
+    ) -> Option<Direction> {
+        let half = (2.0 * scale_px).round_ties_even() as usize;
+        let side = 2 * half;
+        if side > integral.width() || side > integral.height() {
+            return None;
+        }
+        let (last_x, last_y) = (integral.width() - side, integral.height() - side);
+        let to_corner = (side as f32 - 1.0) * 0.5;
+        let (mut xs, mut ys) = ([0.0; POINTS], [0.0; POINTS]);
+        let mut len = 0;
+        for &(dx, dy, weight) in &self.points {
+            let x = (x_px + dx * scale_px - to_corner).round_ties_even();
+            let y = (y_px + dy * scale_px - to_corner).round_ties_even();
+            if x < 0.0 || y < 0.0 || x >= last_x as f32 || y >= last_y as f32 {
+                continue;
+            }
+            let (gx, gy) = gradient(integral, x as usize, y as usize, half);
+            xs[len] = gx as f32 * weight;
+            ys[len] = gy as f32 * weight;
+            len += 1;
+        }
+        (len > 0).then(|| strongest_sector(&xs[..len], &ys[..len]))
+    }
+}
+
+/// Sum of the right less that of the left half of a square of side `2 half` with upper left corner
+/// `(x, y)`, and the same of its lower and upper half.
+fn gradient(integral: &IntegralImage, x: usize, y: usize, half: usize) -> (i32, i32) {
+    let corners = |y| {
+        let row = &integral.row(y)[x..][..2 * half + 1];
+        (row[0], row[half], row[2 * half])
+    };
+    let (top, middle, bottom) = (corners(y), corners(y + half), corners(y + 2 * half));
+    let row_sum = |a: (i32, i32, i32), b: (i32, i32, i32)| {
+        b.2.wrapping_sub(b.0).wrapping_sub(a.2.wrapping_sub(a.0))
+    };
+    let left = bottom
+        .1
+        .wrapping_sub(bottom.0)
+        .wrapping_sub(top.1.wrapping_sub(top.0));
+    let all = row_sum(top, bottom);
+    let upper = row_sum(top, middle);
+    let twice = |part: i32| part.wrapping_add(part);
+    (
+        all.wrapping_sub(twice(left)),
+        all.wrapping_sub(twice(upper)),
+    )
+}
+
+/// The direction of the longest sum of gradients within a sector.
+fn strongest_sector(xs: &[f32], ys: &[f32]) -> Direction {
+    // Gradients by step of directions: all of it, and all but its first degree.
+    let mut whole = [[0.0_f32; SECTORS + 2 * WHOLE_STEPS + 1]; 2];
+    let mut open = [[0.0_f32; SECTORS]; 2];
+    for (&x, &y) in xs.iter().zip(ys) {
+        let degree = angle_rad(x, y).to_degrees().round_ties_even() as usize % 360;
+        let step = degree / SECTOR_STEP_DEG;
+        let at = step + WHOLE_STEPS + 1;
+        whole[0][at] += x;
+        whole[1][at] += y;
+        if !degree.is_multiple_of(SECTOR_STEP_DEG) {
+            open[0][step] += x;
+            open[1][step] += y;
+        }
+    }
+    let sums: [[f32; SECTORS]; 2] = std::array::from_fn(|axis| {
+        let wrapped = &mut whole[axis];
+        wrapped.copy_within(SECTORS..SECTORS + WHOLE_STEPS + 1, 0);
+        wrapped.copy_within(
+            WHOLE_STEPS + 1..2 * WHOLE_STEPS + 1,
+            SECTORS + WHOLE_STEPS + 1,
+        );
+        sector_sums(wrapped, &open[axis])
+    });
+    let mut best = (0.0, 0.0, 0.0);
+    for (&x, &y) in sums[0].iter().zip(&sums[1]) {
+        let square = x * x + y * y;
+        if square > best.0 {
+            best = (square, x, y);
+        }
+    }
+    Direction::of(best.1, best.2)
+}
+
+/// For each step the sum over the sector around its first degree. `wrapped` begins
+/// `WHOLE_STEPS + 1` steps before the first.
+fn sector_sums(
+    wrapped: &[f32; SECTORS + 2 * WHOLE_STEPS + 1],
+    open: &[f32; SECTORS],
+) -> [f32; SECTORS] {
+    let mut sums: [f32; SECTORS] =
+        std::array::from_fn(|step| open[(step + SECTORS - WHOLE_STEPS - 1) % SECTORS]);
+    for lag in 1..=2 * WHOLE_STEPS + 1 {
+        let shifted = wrapped.get(lag..lag + SECTORS).unwrap_or(&[]);
+        sums.iter_mut().zip(shifted).for_each(|(sum, s)| *sum += s);
+    }
+    sums
+}
+
+/// The angle of `(x, y)`, rad in [0, 2π), to 1e-6: the arc tangent as the polynomial of least
+/// greatest error on [0, 1], so that every machine has the same bits.
+fn angle_rad(x: f32, y: f32) -> f32 {
+    use std::f32::consts::{FRAC_PI_2, PI, TAU};
+    const ODD: [f32; 8] = [
+        0.999_999_34,
+        -0.333_298_6,
+        0.199_465_66,
+        -0.139_086_29,
+        0.096_421_97,
+        -0.055_912_32,
+        0.021_862_96,
+        -0.004_054_57,
+    ];
+    let (run, rise) = (x.abs(), y.abs());
+    let ratio = run.min(rise) / run.max(rise).max(f32::MIN_POSITIVE);
+    let square = ratio * ratio;
+    let sum = ODD.iter().rev().fold(0.0, |sum, c| sum * square + c);
+    let first_octant = ratio * sum;
+    let quadrant = if rise > run {
+        FRAC_PI_2 - first_octant
+    } else {
+        first_octant
+    };
+    let half = if x < 0.0 { PI - quadrant } else { quadrant };
+    let angle = if y < 0.0 { TAU - half } else { half };
+    if angle < TAU { angle } else { 0.0 }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::image::GrayImage;
+
+    #[test]
+    fn angles_are_those_of_the_arc_tangent() {
+        for n in 0..100_000 {
+            let truth = f64::from(n) * std::f64::consts::TAU / 100_000.0;
+            let (y, x) = truth.sin_cos();
+            let error = f64::from(angle_rad(7.5 * x as f32, 7.5 * y as f32)) - truth;
+            let turned = (error + std::f64::consts::PI).rem_euclid(std::f64::consts::TAU);
+            assert!(
+                (turned - std::f64::consts::PI).abs() < 1e-6,
+                "{truth} {error}"
+            );
+        }
+        assert_eq!(angle_rad(0.0, 0.0), 0.0);
+        assert!((0.0..std::f32::consts::TAU).contains(&angle_rad(1.0, -1e-30)));
+    }
+
+    #[test]
+    fn the_disc_has_as_many_points_as_said() {
+        let compass = Compass::new();
+        assert!(compass.points.iter().all(|p| p.2 > 0.0));
+        assert_eq!(compass.points.iter().filter(|p| p.2 == 1.0).count(), 1);
+    }
+
+    #[test]
+    fn sectors_are_sixty_degrees_open_at_both_ends() {
+        // One unit gradient in a degree: a sector every 5° has it if it lies within ±29°.
+        for degree in 0..360_usize {
+            let (y, x) = (degree as f32).to_radians().sin_cos();
+            let best = strongest_sector(&[x], &[y]);
+            assert!((best.cos - x).abs() < 1e-6 && (best.sin - y).abs() < 1e-6);
+        }
+        let hit = |degree: usize, sector: usize| {
+            let mut wrapped = [0.0; SECTORS + 2 * WHOLE_STEPS + 1];
+            let mut open = [0.0; SECTORS];
+            for lap in [0, SECTORS, 2 * SECTORS] {
+                let at = degree / 5 + lap + WHOLE_STEPS + 1;
+                if let Some(bin) = at.checked_sub(SECTORS).and_then(|at| wrapped.get_mut(at)) {
+                    *bin = 1.0;
+                }
+            }
+            open[degree / 5] = if degree % 5 == 0 { 0.0 } else { 1.0 };
+            sector_sums(&wrapped, &open)[sector]
+        };
+        for degree in 0..360 {
+            for sector in 0..SECTORS {
+                let apart = (degree as i32 - 5 * sector as i32 + 540) % 360 - 180;
+                let expected = if apart.abs() < 30 { 1.0 } else { 0.0 };
+                assert_eq!(hit(degree, sector), expected, "{degree} {sector}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_ramp_points_uphill() {
+        for degree in (0..360).step_by(7) {
+            let (sin, cos) = f64::from(degree).to_radians().sin_cos();
+            let pixel = |n: u32| {
+                let (x, y) = (f64::from(n % 101) - 50.0, f64::from(n / 101) - 50.0);
+                (128.0 + 1.5 * (x * cos + y * sin)).round() as u8
+            };
+            let pixels = (0..101 * 101).map(pixel).collect();
+            let image = GrayImage::from_vec(101, 101, pixels).unwrap_or_default();
+            let mut integral = IntegralImage::default();
+            integral.compute(&image);
+            let found = Compass::new().direction(&integral, (50.0, 50.0), 3.0);
+            let found = found.map_or(f32::NAN, |d| d.angle_rad.to_degrees());
+            let error = (f64::from(found) - f64::from(degree) + 540.0) % 360.0 - 180.0;
+            assert!(error.abs() < 1.0, "{degree}: {found}");
+        }
+    }
+
+    #[test]
+    fn too_small_an_image_has_no_direction() {
+        let mut integral = IntegralImage::default();
+        integral.compute(&GrayImage::filled(9, 40, 3));
+        assert_eq!(Compass::new().direction(&integral, (4.0, 20.0), 2.4), None);
+    }
+}
