@@ -1,6 +1,7 @@
 //! The command line: one file a command.
 
 mod rig;
+mod simulate;
 
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
@@ -16,6 +17,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Rig(rig::Args),
+    Simulate(Box<simulate::Args>),
 }
 
 /// Why a command did not do what it was asked to.
@@ -44,6 +46,7 @@ impl Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Rig(args) => rig::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
