@@ -2,6 +2,7 @@
 
 mod features;
 mod rig;
+mod simulate;
 
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
@@ -18,6 +19,7 @@ struct Cli {
 enum Command {
     Features(features::Args),
     Rig(rig::Args),
+    Simulate(Box<simulate::Args>),
 }
 
 /// Why a command did not do what it was asked to.
@@ -47,6 +49,7 @@ pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Features(args) => features::run(&args),
         Command::Rig(args) => rig::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,
