@@ -153,12 +153,13 @@ impl<T: Payload> Subscriber<T> {
     pub fn wait(&self, timeout: Duration) -> Result<Wake, IpcError> {
         let deadline = Instant::now() + timeout;
         loop {
+            // Before the messages: a stream that never pauses must not keep the process from ending.
+            if self.node.wait(Duration::ZERO).is_err() {
+                return Ok(Wake::Terminated);
+            }
             let waiting = self.messages.has_samples();
             if waiting.map_err(Services::<T>::transfer_error)? {
                 return Ok(Wake::Message);
-            }
-            if self.node.wait(Duration::ZERO).is_err() {
-                return Ok(Wake::Terminated);
             }
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {

@@ -334,29 +334,33 @@ fn a_killed_publisher_makes_room_for_the_next_and_the_listener_stays() {
 #[test]
 fn a_stopped_consumer_holds_nobody_up_and_learns_what_it_lost() {
     let system = System::new();
-    let stopped = system.listen(&["--json", "--count", "600"]);
+    let mut stopped = system.listen(&["--json", "--count", "300"]);
+    let mut lines = BufReader::new(stopped.stdout.take().unwrap()).lines();
     let mut publisher = Publisher::new(&system.settings).unwrap();
     assert!(publisher.wait_for_subscribers(1, PATIENCE));
+    publisher.publish(&message(0)).unwrap();
+    assert_eq!(sequences(&lines.next().unwrap().unwrap()), [0]);
     signal(&stopped, "STOP");
-    for sequence in 0..3000 {
+    for sequence in 1..3000 {
         publisher.publish(&message(sequence)).unwrap();
     }
-    let awake = system.listen(&["--json", "--count", "100"]);
+    let awake = system.listen(&["--json", "--count", "101"]);
     assert!(publisher.wait_for_subscribers(2, PATIENCE));
     for sequence in 3000..3100 {
         publisher.publish(&message(sequence)).unwrap();
     }
+    // The last message before it came, then all.
     let heard = sequences(&stdout_of(&finished(awake)));
-    assert_eq!(heard, (2999..3099).collect::<Vec<_>>());
+    assert_eq!(heard, (2999..3100).collect::<Vec<_>>());
 
     signal(&stopped, "CONT");
-    publisher.close();
-    signal(&stopped, "TERM");
+    let heard: Vec<_> = lines.flat_map(|line| sequences(&line.unwrap())).collect();
+    let lost = 3100 - 512 - 1;
+    assert_eq!(heard, (lost + 1..=lost + 299).collect::<Vec<_>>());
     let output = finished(stopped);
     assert!(output.status.success());
-    let heard = sequences(&stdout_of(&output));
-    assert!(stderr_of(&output).contains("messages lost before seq"));
-    assert!(heard.windows(2).all(|pair| pair[0] < pair[1]));
+    let told = format!("visod: {lost} messages lost before seq {}", lost + 1);
+    assert!(stderr_of(&output).contains(&told), "{}", stderr_of(&output));
 }
 
 #[test]
