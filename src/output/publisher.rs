@@ -1,7 +1,7 @@
 //! Odometry and health in, the iceoryx2 services `visod/odometry` and `visod/health` out.
 //!
-//! Each message is written straight into shared memory, without allocation, and an event of the
-//! service of the same name wakes those who wait. A subscriber that is slow loses its oldest
+//! Each message is written straight into shared memory (all that is allocated is one small block of
+//! iceoryx2's own), and an event of the service of the same name wakes those who wait. A subscriber that is slow loses its oldest
 //! messages and never holds the publisher up; one that comes late gets the last message.
 //!
 //! # Who may listen
@@ -86,9 +86,9 @@ impl Publisher {
     /// Waits until odometry has that many subscribers; false if the time ran out first.
     #[must_use]
     pub fn wait_for_subscribers(&self, count: usize, timeout: Duration) -> bool {
-        let deadline = Instant::now() + timeout;
+        let start = Instant::now();
         while self.subscribers() < count {
-            if Instant::now() >= deadline {
+            if start.elapsed() >= timeout {
                 return false;
             }
             std::thread::sleep(POLL);
@@ -188,7 +188,8 @@ impl<T: Payload> Channel<T> {
             return;
         }
         let mut connected = 0;
-        while connected < expected {
+        // Those who leave instead of answering are not waited for, once all have left.
+        while connected < expected && self.subscribers() > 0 {
             let left = deadline.saturating_duration_since(Instant::now());
             if left.is_zero() {
                 return;
@@ -199,7 +200,7 @@ impl<T: Payload> Channel<T> {
                         connected += event.count;
                     }
                 },
-                left,
+                left.min(POLL),
             );
             if waited.is_err() {
                 return;

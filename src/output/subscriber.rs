@@ -151,7 +151,8 @@ impl<T: Payload> Subscriber<T> {
     /// # Errors
     /// [`IpcError`]: a publisher could not be connected to, or shared memory is gone.
     pub fn wait(&self, timeout: Duration) -> Result<Wake, IpcError> {
-        let deadline = Instant::now() + timeout;
+        // A deadline beyond what the clock can hold is none.
+        let deadline = Instant::now().checked_add(timeout);
         loop {
             // Before the messages: a stream that never pauses must not keep the process from ending.
             if self.node.wait(Duration::ZERO).is_err() {
@@ -161,7 +162,7 @@ impl<T: Payload> Subscriber<T> {
             if waiting.map_err(Services::<T>::transfer_error)? {
                 return Ok(Wake::Message);
             }
-            let left = deadline.saturating_duration_since(Instant::now());
+            let left = deadline.map_or(SLICE, |d| d.saturating_duration_since(Instant::now()));
             if left.is_zero() {
                 return Ok(Wake::Timeout);
             }

@@ -1,5 +1,10 @@
 //! Publisher and `visod listen` as two processes.
 
+#![expect(
+    clippy::unwrap_used,
+    reason = "a helper of a test fails as the test does"
+)]
+
 use nalgebra::{Isometry3, Matrix6, Vector3, Vector6};
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Output, Stdio};
@@ -271,6 +276,31 @@ fn nothing_is_lost_when_the_publishing_process_ends_at_once() {
         assert!(output.status.success(), "{}", stderr_of(&output));
         assert_eq!(sequences(&stdout_of(&output)), (0..60).collect::<Vec<_>>());
     }
+}
+
+#[test]
+fn a_consumer_that_sleeps_while_the_publisher_leaves_still_gets_all() {
+    let system = System::new();
+    let sleeper = system.listen(&["--json", "--count", "60", "--timeout", "20"]);
+    let patient = Settings {
+        linger_ms: 10_000,
+        ..system.settings.clone()
+    };
+    let mut publisher = Publisher::new(&patient).unwrap();
+    assert!(publisher.wait_for_subscribers(1, PATIENCE));
+    signal(&sleeper, "STOP");
+    for sequence in 0..60 {
+        publisher.publish(&message(sequence)).unwrap();
+    }
+    let leaving = std::thread::spawn(move || publisher.close());
+    // Without the farewell the publisher would be gone long before this.
+    std::thread::sleep(Duration::from_millis(300));
+    assert!(!leaving.is_finished());
+    signal(&sleeper, "CONT");
+    leaving.join().unwrap();
+    let output = finished(sleeper);
+    assert!(output.status.success(), "{}", stderr_of(&output));
+    assert_eq!(sequences(&stdout_of(&output)), (0..60).collect::<Vec<_>>());
 }
 
 #[test]

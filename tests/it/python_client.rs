@@ -3,6 +3,11 @@
 //! Needs a Python with `tools/clients/requirements.txt`: that of `VISOD_TEST_PYTHON`, else `python3`.
 //! Without one these tests say so and do nothing.
 
+#![expect(
+    clippy::unwrap_used,
+    reason = "a helper of a test fails as the test does"
+)]
+
 use crate::publication::{System, message, odometry};
 use serde_json::Value;
 use std::path::PathBuf;
