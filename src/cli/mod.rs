@@ -1,6 +1,7 @@
 //! The command line: one file a command.
 
 mod features;
+mod listen;
 mod rig;
 mod simulate;
 
@@ -18,6 +19,7 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Features(features::Args),
+    Listen(listen::Args),
     Rig(rig::Args),
     Simulate(Box<simulate::Args>),
 }
@@ -48,6 +50,7 @@ impl Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Features(args) => features::run(&args),
+        Command::Listen(args) => listen::run(&args),
         Command::Rig(args) => rig::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };

@@ -46,6 +46,8 @@
 //! | 256 | `[u64; 3]` | `reserved_2` | 0 |
 
 use super::message::{MessageError, check_code, check_header};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
 
 /// First four bytes of a [`HealthMessage`].
 pub const HEALTH_MAGIC: u32 = u32::from_le_bytes(*b"VIOH");
@@ -74,7 +76,7 @@ pub enum CameraState {
 /// How the daemon is, as it lies in shared memory; the module's documentation has the layout.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(feature = "ipc", derive(iceoryx2::prelude::ZeroCopySend))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
 #[cfg_attr(feature = "ipc", type_name("visod::HealthMessage.1"))]
 #[expect(
     missing_docs,

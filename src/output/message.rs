@@ -54,6 +54,8 @@
 use super::mounting::in_base_frame;
 use super::row::{canonical_xyzw, upper_triangle};
 use crate::estimation::{Odometry, Status};
+#[cfg(feature = "ipc")]
+use iceoryx2::prelude::ZeroCopySend;
 use nalgebra::{Isometry3, Matrix6};
 
 /// First four bytes of an [`OdometryMessage`].
@@ -122,7 +124,7 @@ pub struct Latencies {
 /// One estimate, as it lies in shared memory; the module's documentation has the layout.
 #[repr(C)]
 #[derive(Clone, Copy, Debug, PartialEq)]
-#[cfg_attr(feature = "ipc", derive(iceoryx2::prelude::ZeroCopySend))]
+#[cfg_attr(feature = "ipc", derive(ZeroCopySend))]
 #[cfg_attr(feature = "ipc", type_name("visod::OdometryMessage.1"))]
 #[expect(
     missing_docs,

@@ -25,4 +25,4 @@ pub mod subscriber;
 pub mod tum;
 
 #[cfg(feature = "ipc")]
-pub use ipc::IpcError;
+pub use ipc::{IpcError, Payload, monotonic_ns, realtime_ns};

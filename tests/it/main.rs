@@ -5,3 +5,7 @@ mod frame_source;
 #[cfg(test)]
 mod recordings;
 mod features;
+#[cfg(feature = "ipc")]
+mod publication;
+#[cfg(feature = "ipc")]
+mod python_client;

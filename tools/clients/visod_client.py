@@ -1,0 +1,474 @@
+"""visod's odometry and health in Python: shared memory in, dataclasses out.
+
+    from visod_client import OdometrySubscriber
+
+    with OdometrySubscriber() as odometry:
+        for estimate in odometry:              # waits, for ever
+            print(estimate.sequence, estimate.position_m, estimate.sigma_m)
+
+Needs `pip install -r requirements.txt`. The layouts are those of the crate's modules
+`output::message` and `output::health`, byte for byte. Run it as the user of the daemon: iceoryx2
+lets nobody else in, and says nothing about it.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+import time
+from dataclasses import dataclass
+from typing import Generic, Iterator, Optional, Tuple, TypeVar
+
+import iceoryx2 as iox2
+
+ODOMETRY_SERVICE = "visod/odometry"
+HEALTH_SERVICE = "visod/health"
+
+# Sizes of the services; whoever comes first creates them, so all must agree.
+_BUFFERS = {ODOMETRY_SERVICE: 512, HEALTH_SERVICE: 16}
+_MAX_SUBSCRIBERS = 16
+_MAX_PUBLISHERS = 4
+_MAX_NODES = 40
+_EVENT_LEAVING = 1
+_EVENT_CONNECTED = 2
+_EVENT_MAX = 7
+
+STATUSES = ("initializing", "tracking", "degraded", "lost")
+FRAMES = ("left_camera", "base")
+CAMERA_STATES = ("closed", "opening", "streaming", "stalled", "lost")
+BUDGET_PARTS = ("detection", "calibration", "synchronisation", "bridging")
+STAGES = ("capture", "features", "matching", "estimation", "total")
+
+_FLAG_REPLAY = 1
+
+Matrix = Tuple[Tuple[float, ...], ...]
+
+
+class MessageError(ValueError):
+    """A message that this client cannot use."""
+
+
+class OdometryMessage(ctypes.Structure):
+    """`visod/odometry`, layout version 1."""
+
+    MAGIC = int.from_bytes(b"VIOD", "little")
+    VERSION = 1
+    _fields_ = [
+        ("magic", ctypes.c_uint32),
+        ("version", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("sequence", ctypes.c_uint64),
+        ("message_number", ctypes.c_uint64),
+        ("realtime_ns", ctypes.c_int64),
+        ("monotonic_ns", ctypes.c_int64),
+        ("published_monotonic_ns", ctypes.c_int64),
+        ("epoch", ctypes.c_uint32),
+        ("status", ctypes.c_uint32),
+        ("frame", ctypes.c_uint32),
+        ("budget_modelled", ctypes.c_uint32),
+        ("keypoints_left", ctypes.c_uint32),
+        ("keypoints_right", ctypes.c_uint32),
+        ("stereo_matches", ctypes.c_uint32),
+        ("tracks", ctypes.c_uint32),
+        ("inliers", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+        ("variance_factor", ctypes.c_double),
+        ("position_m", ctypes.c_double * 3),
+        ("orientation_xyzw", ctypes.c_double * 4),
+        ("motion_translation_m", ctypes.c_double * 3),
+        ("motion_rotation_xyzw", ctypes.c_double * 4),
+        ("twist", ctypes.c_double * 6),
+        ("cov_pose", ctypes.c_double * 36),
+        ("cov_motion", ctypes.c_double * 36),
+        ("cov_twist", ctypes.c_double * 36),
+        ("budget_detection", ctypes.c_double * 21),
+        ("budget_calibration", ctypes.c_double * 21),
+        ("budget_synchronisation", ctypes.c_double * 21),
+        ("budget_bridging", ctypes.c_double * 21),
+        ("latency_capture_ns", ctypes.c_uint64),
+        ("latency_features_ns", ctypes.c_uint64),
+        ("latency_matching_ns", ctypes.c_uint64),
+        ("latency_estimation_ns", ctypes.c_uint64),
+        ("latency_total_ns", ctypes.c_uint64),
+        ("reserved_2", ctypes.c_uint64),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """The name by which iceoryx2 knows that both sides mean the same layout."""
+        return "visod::OdometryMessage.1"
+
+
+class HealthMessage(ctypes.Structure):
+    """`visod/health`, layout version 1."""
+
+    MAGIC = int.from_bytes(b"VIOH", "little")
+    VERSION = 1
+    _fields_ = [
+        ("magic", ctypes.c_uint32),
+        ("version", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("odometry_status", ctypes.c_uint32),
+        ("message_number", ctypes.c_uint64),
+        ("realtime_ns", ctypes.c_int64),
+        ("monotonic_ns", ctypes.c_int64),
+        ("left_state", ctypes.c_uint32),
+        ("right_state", ctypes.c_uint32),
+        ("left_frames", ctypes.c_uint64),
+        ("right_frames", ctypes.c_uint64),
+        ("left_reconnects", ctypes.c_uint64),
+        ("right_reconnects", ctypes.c_uint64),
+        ("left_last_monotonic_ns", ctypes.c_int64),
+        ("right_last_monotonic_ns", ctypes.c_int64),
+        ("left_lost_in_transport", ctypes.c_uint64),
+        ("right_lost_in_transport", ctypes.c_uint64),
+        ("left_unreadable", ctypes.c_uint64),
+        ("right_unreadable", ctypes.c_uint64),
+        ("left_unmatched", ctypes.c_uint64),
+        ("right_unmatched", ctypes.c_uint64),
+        ("pairs_processed", ctypes.c_uint64),
+        ("pairs_unusable", ctypes.c_uint64),
+        ("pairs_dropped", ctypes.c_uint64),
+        ("pairs_degraded", ctypes.c_uint64),
+        ("pairs_lost", ctypes.c_uint64),
+        ("restarts", ctypes.c_uint64),
+        ("over_budget", ctypes.c_uint64),
+        ("publish_failures", ctypes.c_uint64),
+        ("budget_ns", ctypes.c_uint64),
+        ("busy_mean_ns", ctypes.c_uint64),
+        ("busy_max_ns", ctypes.c_uint64),
+        ("uptime_ns", ctypes.c_uint64),
+        ("subscribers", ctypes.c_uint64),
+        ("degraded_mode", ctypes.c_uint32),
+        ("reserved", ctypes.c_uint32),
+        ("reserved_2", ctypes.c_uint64 * 3),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """The name by which iceoryx2 knows that both sides mean the same layout."""
+        return "visod::HealthMessage.1"
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """One estimate. Covariances are ordered x, y, z, rx, ry, rz (m², m·rad, rad²)."""
+
+    sequence: int
+    message_number: int
+    epoch: int
+    status: str
+    frame: str
+    replay: bool
+    realtime_ns: int
+    monotonic_ns: Optional[int]
+    published_monotonic_ns: int
+    position_m: Tuple[float, ...]
+    orientation_xyzw: Tuple[float, ...]
+    cov_pose: Matrix
+    motion_translation_m: Tuple[float, ...]
+    motion_rotation_xyzw: Tuple[float, ...]
+    cov_motion: Matrix
+    twist: Tuple[float, ...]
+    cov_twist: Matrix
+    budget: dict[str, Optional[Matrix]]
+    keypoints_left: int
+    keypoints_right: int
+    stereo_matches: int
+    tracks: int
+    inliers: int
+    variance_factor: float
+    latencies_ns: dict[str, Optional[int]]
+
+    @property
+    def sigma_m(self) -> Tuple[float, ...]:
+        """1 σ of the position, m."""
+        return tuple(math.sqrt(max(self.cov_pose[i][i], 0.0)) for i in range(3))
+
+    @property
+    def sigma_rad(self) -> Tuple[float, ...]:
+        """1 σ of the orientation about the fixed axes, rad."""
+        return tuple(math.sqrt(max(self.cov_pose[i][i], 0.0)) for i in range(3, 6))
+
+    @staticmethod
+    def from_message(m: OdometryMessage) -> "Odometry":
+        """Checks a message and copies it out of shared memory."""
+        _check_layout(m, OdometryMessage)
+        finite = (
+            *m.position_m, *m.orientation_xyzw, *m.motion_translation_m,
+            *m.motion_rotation_xyzw, *m.twist, *m.cov_pose, *m.cov_motion, *m.cov_twist,
+        )  # fmt: skip
+        if not all(map(math.isfinite, finite)):
+            raise MessageError("the message holds a number that is not finite")
+        return Odometry(
+            sequence=m.sequence,
+            message_number=m.message_number,
+            epoch=m.epoch,
+            status=_word(STATUSES, m.status, "status"),
+            frame=_word(FRAMES, m.frame, "frame"),
+            replay=bool(m.flags & _FLAG_REPLAY),
+            realtime_ns=m.realtime_ns,
+            monotonic_ns=m.monotonic_ns or None,
+            published_monotonic_ns=m.published_monotonic_ns,
+            position_m=tuple(m.position_m),
+            orientation_xyzw=tuple(m.orientation_xyzw),
+            cov_pose=_full(m.cov_pose),
+            motion_translation_m=tuple(m.motion_translation_m),
+            motion_rotation_xyzw=tuple(m.motion_rotation_xyzw),
+            cov_motion=_full(m.cov_motion),
+            twist=tuple(m.twist),
+            cov_twist=_full(m.cov_twist),
+            budget={
+                part: _symmetric(getattr(m, f"budget_{part}"))
+                if m.budget_modelled >> bit & 1
+                else None
+                for bit, part in enumerate(BUDGET_PARTS)
+            },
+            keypoints_left=m.keypoints_left,
+            keypoints_right=m.keypoints_right,
+            stereo_matches=m.stereo_matches,
+            tracks=m.tracks,
+            inliers=m.inliers,
+            variance_factor=m.variance_factor,
+            latencies_ns={
+                stage: getattr(m, f"latency_{stage}_ns") or None for stage in STAGES
+            },
+        )
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How one camera is."""
+
+    state: str
+    frames: int
+    reconnects: int
+    last_monotonic_ns: Optional[int]
+    lost_in_transport: int
+    unreadable: int
+    unmatched: int
+
+
+@dataclass(frozen=True)
+class Health:
+    """How the daemon is. Counters count from its start."""
+
+    message_number: int
+    odometry_status: str
+    realtime_ns: int
+    monotonic_ns: int
+    left: Camera
+    right: Camera
+    pairs_processed: int
+    pairs_unusable: int
+    pairs_dropped: int
+    pairs_degraded: int
+    pairs_lost: int
+    restarts: int
+    over_budget: int
+    publish_failures: int
+    budget_ns: Optional[int]
+    busy_mean_ns: int
+    busy_max_ns: int
+    uptime_ns: int
+    subscribers: int
+    degraded_mode: int
+
+    @staticmethod
+    def from_message(m: HealthMessage) -> "Health":
+        """Checks a message and copies it out of shared memory."""
+        _check_layout(m, HealthMessage)
+        plain = (
+            "message_number", "realtime_ns", "monotonic_ns", "pairs_processed", "pairs_unusable",
+            "pairs_dropped", "pairs_degraded", "pairs_lost", "restarts", "over_budget",
+            "publish_failures", "busy_mean_ns", "busy_max_ns", "uptime_ns", "subscribers",
+            "degraded_mode",
+        )  # fmt: skip
+        return Health(
+            odometry_status=_word(STATUSES, m.odometry_status, "odometry_status"),
+            left=_camera(m, "left"),
+            right=_camera(m, "right"),
+            budget_ns=m.budget_ns or None,
+            **{name: getattr(m, name) for name in plain},
+        )
+
+
+def _camera(m: HealthMessage, side: str) -> Camera:
+    def field(name: str) -> int:
+        return getattr(m, f"{side}_{name}")
+
+    return Camera(
+        state=_word(CAMERA_STATES, field("state"), f"{side}_state"),
+        frames=field("frames"),
+        reconnects=field("reconnects"),
+        last_monotonic_ns=field("last_monotonic_ns") or None,
+        lost_in_transport=field("lost_in_transport"),
+        unreadable=field("unreadable"),
+        unmatched=field("unmatched"),
+    )
+
+
+def _check_layout(m, layout) -> None:
+    if m.magic != layout.MAGIC:
+        raise MessageError(f"not a {layout.__name__}: it begins with {m.magic:#010x}")
+    if (m.version, m.size) != (layout.VERSION, ctypes.sizeof(layout)):
+        raise MessageError(
+            f"the message has layout version {m.version} of {m.size} bytes, but this client"
+            f" knows version {layout.VERSION} of {ctypes.sizeof(layout)} bytes"
+        )
+
+
+def _word(words: Tuple[str, ...], code: int, field: str) -> str:
+    if code >= len(words):
+        raise MessageError(f"{field} of the message is {code}, which is not defined")
+    return words[code]
+
+
+def _full(values) -> Matrix:
+    return tuple(tuple(values[6 * i : 6 * i + 6]) for i in range(6))
+
+
+def _symmetric(triangle) -> Matrix:
+    entries = iter(triangle)
+    m = [[0.0] * 6 for _ in range(6)]
+    for i in range(6):
+        for j in range(i, 6):
+            m[i][j] = m[j][i] = next(entries)
+    return tuple(map(tuple, m))
+
+
+T = TypeVar("T")
+
+
+class _Subscriber(Generic[T]):
+    """Receives the messages of one service. It may be opened before any publisher is there.
+
+    `root` and `prefix` are the publisher's `publish.root` and `publish.prefix`; what is not given
+    comes from iceoryx2's own configuration. `lost` counts messages that came faster than they were
+    fetched.
+    """
+
+    _service: str
+    _layout: type
+    _decode: staticmethod
+
+    def __init__(
+        self,
+        root: Optional[str | os.PathLike] = None,
+        prefix: Optional[str] = None,
+        node_name: str = "visod_client",
+    ) -> None:
+        iox2.set_log_level_from_env_or(iox2.LogLevel.Fatal)
+        config = iox2.config.global_config()
+        if root is not None:
+            config.global_cfg.root_path = iox2.Path.new(os.fspath(root))
+        if prefix is not None:
+            config.global_cfg.prefix = iox2.FileName.new(prefix)
+        self.lost = 0
+        self._last: Optional[int] = None
+        self._publisher = None
+        # Signals stay with Python, so that Ctrl-C raises KeyboardInterrupt as everywhere.
+        self._node = (
+            iox2.NodeBuilder.new()
+            .name(iox2.NodeName.new(node_name))
+            .signal_handling_mode(iox2.SignalHandlingMode.Disabled)
+            .config(config)
+            .create(iox2.ServiceType.Ipc)
+        )
+        name = iox2.ServiceName.new(self._service)
+        self._events = (
+            self._node.service_builder(name)
+            .event()
+            .event_id_max_value(_EVENT_MAX)
+            .max_listeners(_MAX_SUBSCRIBERS + _MAX_PUBLISHERS)
+            .max_notifiers(_MAX_SUBSCRIBERS + _MAX_PUBLISHERS)
+            .max_nodes(_MAX_NODES)
+            .open_or_create()
+        )
+        self._messages = (
+            self._node.service_builder(name)
+            .publish_subscribe(self._layout)
+            .enable_safe_overflow(True)
+            .subscriber_max_buffer_size(_BUFFERS[self._service])
+            .history_size(1)
+            .max_subscribers(_MAX_SUBSCRIBERS)
+            .max_publishers(_MAX_PUBLISHERS)
+            .max_nodes(_MAX_NODES)
+            .open_or_create()
+        )
+        self._listener = self._events.listener_builder().create()
+        self._notifier = (
+            self._events.notifier_builder()
+            .default_event_id(iox2.EventId.new(_EVENT_CONNECTED))
+            .create()
+        )
+        self._subscriber = self._messages.subscriber_builder().create()
+
+    def receive(self) -> Optional[T]:
+        """The next message, if there is one. Raises MessageError for one that cannot be used."""
+        sample = self._subscriber.receive()
+        if sample is None:
+            return None
+        try:
+            publisher = str(sample.header.publisher_id)
+            message = self._decode(sample.payload().contents)
+        finally:
+            sample.delete()
+        if publisher == self._publisher:
+            self.lost += message.message_number - self._last - 1
+        self._publisher, self._last = publisher, message.message_number
+        return message
+
+    def wait(self, timeout_s: Optional[float] = None) -> Optional[T]:
+        """Waits for the next message; None if there was none in time."""
+        deadline = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            message = self.receive()
+            if message is not None:
+                return message
+            left = math.inf if deadline is None else deadline - time.monotonic()
+            if left <= 0:
+                return None
+            # Short enough for Ctrl-C, and for a last message handed to a late joiner, which has
+            # no event.
+            self._wait_for_event(min(left, 0.1))
+
+    def _wait_for_event(self, timeout_s: float) -> None:
+        events = self._listener.timed_wait(iox2.Duration.from_secs_f64(timeout_s))
+        if any(event.id.as_value == _EVENT_LEAVING for event in events):
+            # Connects to what a leaving publisher has sent, then tells it that it may go.
+            self._subscriber.has_samples()
+            self._notifier.notify()
+
+    def __iter__(self) -> Iterator[T]:
+        while True:
+            yield self.wait()
+
+    def close(self) -> None:
+        """Leaves the service."""
+        for port in (self._subscriber, self._listener, self._notifier):
+            port.delete()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_) -> None:
+        self.close()
+
+
+class OdometrySubscriber(_Subscriber[Odometry]):
+    """Receives odometry."""
+
+    _service = ODOMETRY_SERVICE
+    _layout = OdometryMessage
+    _decode = staticmethod(Odometry.from_message)
+
+
+class HealthSubscriber(_Subscriber[Health]):
+    """Receives the state of the daemon."""
+
+    _service = HEALTH_SERVICE
+    _layout = HealthMessage
+    _decode = staticmethod(Health.from_message)
