@@ -1,5 +1,6 @@
 //! The command line: one file a command.
 
+mod evaluate;
 mod rig;
 
 use clap::{Parser, Subcommand};
@@ -15,6 +16,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Evaluate(evaluate::Args),
     Rig(rig::Args),
 }
 
@@ -43,6 +45,7 @@ impl Failure {
 /// other failure.
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Rig(args) => rig::run(&args),
     };
     match result {
