@@ -278,6 +278,12 @@ fn remark(evaluation: &mut Evaluation, settings: &Settings) {
             evaluation.restarts
         ));
     }
+    if evaluation.segments.all.segments == 0 {
+        notes.push(format!(
+            "the path of {:.1} m is too short for a segment: give shorter lengths, as in --lengths 10,20,30,40,50",
+            evaluation.path_m
+        ));
+    }
     for how in &settings.alignments {
         if !evaluation.ate.iter().any(|ate| ate.alignment == *how) {
             notes.push(format!(
@@ -288,3 +294,6 @@ fn remark(evaluation: &mut Evaluation, settings: &Settings) {
     evaluation.errors = errors;
     evaluation.notes = notes;
 }
+
+#[cfg(test)]
+mod tests;

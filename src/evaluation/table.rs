@@ -158,7 +158,7 @@ fn write_consistency(f: &mut Formatter<'_>, consistency: &Consistency) -> Result
         let verdict = match white.autocorrelation.abs() <= white.limit {
             true => "white",
             false => {
-                "not white: neighbouring motions share errors, so the intervals above are too narrow"
+                "not white: neighbouring motions share errors, so the intervals above hold only roughly"
             }
         };
         writeln!(

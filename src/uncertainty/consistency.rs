@@ -114,3 +114,133 @@ fn is_symmetric<const N: usize>(m: &SMatrix<f64, N, N>) -> bool {
         })
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Matrix6, Vector6};
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    /// A covariance whose elements differ by as much as metres² and radians² do.
+    fn lower() -> Matrix6<f64> {
+        let sigma = [0.02, 0.01, 0.05, 3e-4, 5e-4, 2e-4];
+        Matrix6::from_fn(|i, j| match i.cmp(&j) {
+            std::cmp::Ordering::Less => 0.0,
+            std::cmp::Ordering::Equal => sigma[i],
+            std::cmp::Ordering::Greater => sigma[i] * 0.6 / (1.0 + (i + j) as f64),
+        })
+    }
+
+    fn sampled_errors(count: usize, seed: u64) -> Vec<Vector6<f64>> {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+        (0..count)
+            .map(|_| lower() * Vector6::from_fn(|_, _| StandardNormal.sample(&mut rng)))
+            .collect()
+    }
+
+    #[test]
+    fn anees_intervals_are_those_that_the_theory_prints() {
+        for (runs, low, high) in [
+            (50, 0.846, 1.166),
+            (100, 0.890, 1.116),
+            (300, 0.936, 1.066),
+            (1000, 0.965, 1.036),
+        ] {
+            let (lo, hi) = anees_interval(6, runs, 0.95);
+            assert!(
+                (lo - low).abs() < 5e-4 && (hi - high).abs() < 5e-4,
+                "{runs}: {lo} {hi}"
+            );
+        }
+    }
+
+    #[test]
+    fn chi2_quantiles_agree_with_scipy_up_to_a_hundred_million_degrees_of_freedom() {
+        for (dof, probability, quantile) in [
+            (1.0, 0.025, 0.0009820691171752555),
+            (3.0, 0.95, 7.814727903251179),
+            (6.0, 0.025, 1.2373442457912027),
+            (6.0, 0.95, 12.591587243743977),
+            (6.0, 0.975, 14.44937533544792),
+            (300.0, 0.025, 253.91232260248975),
+            (30_000.0, 0.975, 30_481.982656347922),
+            (1e6, 0.025, 997_230.0871432901),
+            (1e8, 0.975, 100_027_719.97074424),
+        ] {
+            let ours = chi2_quantile(probability, dof);
+            assert!(
+                (ours / quantile - 1.0).abs() < 1e-9,
+                "{dof} {probability}: {ours}"
+            );
+        }
+        assert!(chi2_quantile(0.95, 0.0).is_nan() && chi2_quantile(1.0, 6.0).is_nan());
+    }
+
+    #[test]
+    fn sampled_errors_are_found_consistent_and_scaled_ones_are_not() {
+        let cov = lower() * lower().transpose();
+        let errors = sampled_errors(1000, 3);
+        let anees = |factor: f64| {
+            let sum: f64 = errors.iter().filter_map(|e| nees(e, &(cov * factor))).sum();
+            sum / (6.0 * errors.len() as f64)
+        };
+        let (lo, hi) = anees_interval(6, errors.len(), 0.95);
+        assert!((lo..hi).contains(&anees(1.0)), "{}", anees(1.0));
+        assert!(anees(0.8) > hi && anees(1.25) < lo);
+    }
+
+    #[test]
+    fn the_ellipsoid_holds_as_many_as_it_says() {
+        let cov = lower() * lower().transpose();
+        let values: Vec<f64> = sampled_errors(2000, 5)
+            .iter()
+            .filter_map(|e| nees(e, &cov))
+            .collect();
+        let (lo, hi) = coverage_interval(values.len(), 0.95);
+        assert!((lo..=hi).contains(&coverage(&values, 6, 0.95)));
+        assert!((0.93..0.95).contains(&lo) && (0.95..0.97).contains(&hi));
+    }
+
+    #[test]
+    fn autocorrelation_tells_white_errors_from_a_moving_average() {
+        let cov = lower() * lower().transpose();
+        let white: Vec<_> = sampled_errors(1001, 7)
+            .iter()
+            .filter_map(|e| whiten(e, &cov))
+            .collect();
+        let pairs = |w: &[Vector6<f64>]| w.windows(2).map(|p| (p[0], p[1])).collect::<Vec<_>>();
+        let limit = autocorrelation_limit(6 * 1000, 0.95);
+        assert!(autocorrelation(&pairs(&white)).abs() < limit);
+        // a − b, b − c, …: half of the variance is shared with the opposite sign.
+        let shared: Vec<_> = white.windows(2).map(|p| p[0] - p[1]).collect();
+        assert!((autocorrelation(&pairs(&shared)) + 0.5).abs() < 0.05);
+    }
+
+    #[test]
+    fn what_is_no_covariance_is_refused() {
+        let error = Vector6::repeat(0.1);
+        assert!(nees(&error, &Matrix6::zeros()).is_none());
+        assert!(nees(&error, &-Matrix6::identity()).is_none());
+        assert!(nees(&error, &Matrix6::repeat(1.0)).is_none());
+        assert!(nees(&error, &(Matrix6::identity() * f64::NAN)).is_none());
+        let mut lopsided = Matrix6::identity();
+        lopsided[(0, 1)] = 0.1;
+        assert!(nees(&error, &lopsided).is_none());
+        assert!(nees(&(error * f64::NAN), &Matrix6::identity()).is_none());
+    }
+
+    proptest! {
+        #[test]
+        fn nees_does_not_depend_on_the_units(scales in prop::array::uniform6(-6.0..6.0_f64)) {
+            let units = Matrix6::from_diagonal(&Vector6::from(scales.map(|s| 10_f64.powf(s))));
+            let cov = lower() * lower().transpose();
+            let error = sampled_errors(1, 11)[0];
+            let plain = nees(&error, &cov).unwrap();
+            let rescaled = nees(&(units * error), &(units * cov * units)).unwrap();
+            prop_assert!((rescaled / plain - 1.0).abs() < 1e-9);
+        }
+    }
+}
