@@ -2,6 +2,7 @@
 
 mod features;
 mod listen;
+mod evaluate;
 mod rig;
 mod simulate;
 
@@ -20,6 +21,7 @@ struct Cli {
 enum Command {
     Features(features::Args),
     Listen(listen::Args),
+    Evaluate(evaluate::Args),
     Rig(rig::Args),
     Simulate(Box<simulate::Args>),
 }
@@ -51,6 +53,7 @@ pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Features(args) => features::run(&args),
         Command::Listen(args) => listen::run(&args),
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Rig(args) => rig::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };

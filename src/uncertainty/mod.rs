@@ -4,3 +4,4 @@ pub mod compounding;
 mod implicit;
 
 pub use implicit::{derivative_of_minimiser, propagate};
+pub mod consistency;

@@ -9,3 +9,4 @@ mod features;
 mod publication;
 #[cfg(feature = "ipc")]
 mod python_client;
+mod evaluate;
