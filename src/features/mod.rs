@@ -2,6 +2,9 @@
 //!
 //! Positions are raw image pixels (distorted, unrectified), pixel centres at integers.
 
+#[cfg(feature = "opencv")]
+pub mod opencv;
+
 use crate::image::GrayImage;
 
 /// One distinctive point of an image.
