@@ -10,6 +10,8 @@ mod orientation;
 mod pyramid;
 mod spread;
 pub mod surf;
+#[cfg(feature = "opencv")]
+pub mod opencv;
 
 use crate::image::GrayImage;
 

@@ -79,3 +79,7 @@ impl Settings {
         SettingError::unless_in("max_size_ratio", self.max_size_ratio, 1.0..=10.0)
     }
 }
+//! Matching: features in, left–right matches and tracks over time out.
+
+#[cfg(feature = "opencv")]
+pub mod flann;

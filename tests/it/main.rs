@@ -10,3 +10,7 @@ mod publication;
 #[cfg(feature = "ipc")]
 mod python_client;
 mod evaluate;
+// `cfg(test)` lets clippy know that its helpers may unwrap too.
+#[cfg(test)]
+#[cfg(feature = "opencv")]
+mod opencv;
