@@ -2,16 +2,19 @@
 //!
 //! Positions are raw image pixels (distorted, unrectified), pixel centres at integers.
 
+mod choice;
 mod descriptor;
 mod extrema;
 mod hessian;
 mod integral;
+#[cfg(feature = "opencv")]
+pub mod opencv;
 mod orientation;
 mod pyramid;
 mod spread;
 pub mod surf;
-#[cfg(feature = "opencv")]
-pub mod opencv;
+
+pub use choice::{DetectorName, Settings, extractor};
 
 use crate::image::GrayImage;
 

@@ -1,7 +1,7 @@
 //! Uncertainty: how an error travels, and how to tell whether a covariance holds.
 
 pub mod compounding;
+pub mod consistency;
 mod implicit;
 
 pub use implicit::{derivative_of_minimiser, propagate};
-pub mod consistency;
