@@ -1,8 +1,8 @@
 //! The command line: one file a command.
 
+mod evaluate;
 mod features;
 mod listen;
-mod evaluate;
 mod rig;
 mod simulate;
 

@@ -6,6 +6,8 @@
 //! rectified rows, over time near the predicted position. No image is resampled.
 
 mod descriptor;
+#[cfg(feature = "opencv")]
+pub mod flann;
 mod stereo;
 mod temporal;
 
@@ -79,7 +81,3 @@ impl Settings {
         SettingError::unless_in("max_size_ratio", self.max_size_ratio, 1.0..=10.0)
     }
 }
-//! Matching: features in, left–right matches and tracks over time out.
-
-#[cfg(feature = "opencv")]
-pub mod flann;
