@@ -176,7 +176,15 @@ pub(super) fn open_node(
         .config(&config)
         .signal_handling_mode(signals)
         .create::<Ipc>()
-        .map_err(|e| failed(explain(&format!("{e:?}"))))
+        .map_err(|e| {
+            // iceoryx2 calls this an internal error.
+            match std::fs::read_dir(config.global.root_path().to_string()) {
+                Err(e) if e.kind() == std::io::ErrorKind::PermissionDenied => {
+                    failed("it belongs to another user, whom this process must run as".to_owned())
+                }
+                _ => failed(explain(&format!("{e:?}"))),
+            }
+        })
 }
 
 /// iceoryx2's own configuration with what the settings say otherwise.
@@ -288,6 +296,8 @@ fn explain(cause: &str) -> String {
         "a process of another version uses it"
     } else if cause.contains("DoesNotSupportRequested") {
         "a process that has it open created it with other sizes: end that process and start again"
+    } else if cause.contains("ResourceCreationFailed") {
+        "its socket cannot be created, perhaps since the root's path is too long"
     } else if cause.contains("ExceedsMax") {
         "too many processes use it already"
     } else {

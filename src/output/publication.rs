@@ -42,8 +42,8 @@ pub mod events {
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
     /// Directory below which iceoryx2 keeps its files; under systemd the unit's runtime directory.
-    /// Path, absolute, at most 60 bytes, default none: as iceoryx2 is configured, else
-    /// `/tmp/iceoryx2`, where every consumer looks.
+    /// Path, absolute, at most 60 bytes together with the prefix, default none: as iceoryx2 is
+    /// configured, else `/tmp/iceoryx2`, where every consumer looks.
     pub root: Option<PathBuf>,
     /// Prefix of iceoryx2's files and shared memory, which keeps several systems on one host apart.
     /// Letters, digits, `_`, `-` and `.`, at most 32, default none: as iceoryx2 is configured, else
@@ -78,26 +78,27 @@ impl Settings {
     /// # Errors
     /// The first setting that cannot be.
     pub fn check(&self) -> Result<(), SettingError> {
-        if let Some(root) = &self.root {
-            check_root(root)?;
-        }
         if let Some(prefix) = &self.prefix {
             check_prefix(prefix)?;
+        }
+        if let Some(root) = &self.root {
+            check_root(root, self.prefix.as_deref().unwrap_or("iox2_"))?;
         }
         SettingError::unless_in("linger_ms", self.linger_ms, 0..=10_000)
     }
 }
 
-/// Longest root, bytes: the sockets below it have paths of at most 107 bytes.
-const MAX_ROOT_BYTES: usize = 60;
+/// Longest root and prefix together, bytes. A socket's path, of at most 107 bytes, adds a slash, a
+/// number of up to 39 digits and `.event`.
+const MAX_ROOT_AND_PREFIX_BYTES: usize = 60;
 /// Longest prefix, bytes.
 const MAX_PREFIX_BYTES: usize = 32;
 
-fn check_root(root: &std::path::Path) -> Result<(), SettingError> {
+fn check_root(root: &std::path::Path, prefix: &str) -> Result<(), SettingError> {
     let cause = if !root.is_absolute() {
         "must be an absolute path"
-    } else if root.as_os_str().len() > MAX_ROOT_BYTES {
-        "must be at most 60 bytes long, since sockets lie below it"
+    } else if root.as_os_str().len() + prefix.len() > MAX_ROOT_AND_PREFIX_BYTES {
+        "must be, together with the prefix, at most 60 bytes long, since sockets lie below it"
     } else if root.to_str().is_none() {
         "must be text in UTF-8"
     } else {
@@ -138,8 +139,9 @@ mod tests {
         };
         assert_eq!(key_of(&with_root("/run/visod")), None);
         assert_eq!(key_of(&with_root("run")), Some("root"));
+        assert_eq!(key_of(&with_root(&format!("/{}", "x".repeat(54)))), None);
         assert_eq!(
-            key_of(&with_root(&format!("/{}", "x".repeat(60)))),
+            key_of(&with_root(&format!("/{}", "x".repeat(55)))),
             Some("root")
         );
         let with_prefix = |prefix: &str| Settings {

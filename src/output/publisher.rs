@@ -7,9 +7,10 @@
 //! # Who may listen
 //!
 //! iceoryx2 creates its files for the publisher's own user (mode 0600, directories 0750). A process
-//! of another user receives nothing; run consumers as the daemon's user. The only wider access that
-//! iceoryx2 offers is its Cargo feature `dev_permissions`, which lets every local user read *and
-//! write*, and is not used here: whoever can write could forge poses.
+//! of another user is refused, or, where it may create a root of its own, receives nothing; run
+//! consumers as the daemon's user. The only wider access that iceoryx2 offers is its Cargo feature
+//! `dev_permissions`, which lets every local user read *and write*, and is not used here: whoever
+//! can write could forge poses.
 
 use super::health::HealthMessage;
 use super::ipc::{Ipc, IpcError, Payload, Services, monotonic_ns, open_node};

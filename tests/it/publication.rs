@@ -394,6 +394,24 @@ fn a_stopped_consumer_holds_nobody_up_and_learns_what_it_lost() {
 }
 
 #[test]
+fn the_longest_root_and_prefix_that_are_allowed_work() {
+    let mut system = System::new();
+    let mut root = system.root();
+    let prefix_bytes = system.prefix().len();
+    assert!(
+        root.len() + prefix_bytes <= 60,
+        "the temporary directory lies too deep"
+    );
+    root.extend(std::iter::repeat_n('x', 60 - prefix_bytes - root.len()));
+    system.settings.root = Some(root.into());
+    let mut subscriber = OdometrySubscriber::new("test", &system.settings).unwrap();
+    let mut publisher = Publisher::new(&system.settings).unwrap();
+    publisher.publish(&message(7)).unwrap();
+    assert_eq!(subscriber.wait(PATIENCE), Ok(Wake::Message));
+    assert_eq!(subscriber.receive().unwrap().unwrap().message.sequence, 7);
+}
+
+#[test]
 fn two_publishers_are_refused_unless_allowed() {
     let system = System::new();
     let _first = Publisher::new(&system.settings).unwrap();
