@@ -3,8 +3,12 @@
 mod evaluate;
 mod features;
 mod listen;
+mod progress;
+mod replay;
 mod rig;
+mod session;
 mod simulate;
+mod summary;
 
 use clap::{Parser, Subcommand};
 use std::process::ExitCode;
@@ -19,11 +23,12 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
-    Features(features::Args),
+    Replay(replay::Args),
+    Simulate(Box<simulate::Args>),
     Listen(listen::Args),
     Evaluate(evaluate::Args),
+    Features(features::Args),
     Rig(rig::Args),
-    Simulate(Box<simulate::Args>),
 }
 
 /// Why a command did not do what it was asked to.
@@ -51,11 +56,12 @@ impl Failure {
 /// other failure.
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
-        Command::Features(args) => features::run(&args),
+        Command::Replay(args) => replay::run(&args),
+        Command::Simulate(args) => simulate::run(&args),
         Command::Listen(args) => listen::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Features(args) => features::run(&args),
         Command::Rig(args) => rig::run(&args),
-        Command::Simulate(args) => simulate::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -1,12 +1,11 @@
 //! `visod simulate`: renders a dataset with ground truth.
 
-use super::Failure;
+use super::{Failure, progress};
 use crate::geometry::{load_rig, so3};
 use crate::simulation::{
     DatasetError, DatasetWriter, SceneName, Settings, Simulation, TrajectoryName, sensor,
     thesis_rig,
 };
-use indicatif::{ProgressBar, ProgressStyle};
 use std::path::PathBuf;
 
 /// Render a stereo recording whose true poses are known.
@@ -99,7 +98,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let simulation = Simulation::new(args.scene, args.trajectory, rig, args.settings())
         .map_err(Failure::usage)?;
     let mut writer = DatasetWriter::create(&args.out, simulation.rig()).map_err(failure)?;
-    let bar = progress_bar(args.frames);
+    let bar = progress::pairs(Some(args.frames));
     for frame in 0..args.frames {
         let (pair, odom_from_camera) = simulation.pair(frame);
         writer.add(&pair, &odom_from_camera).map_err(failure)?;
@@ -181,11 +180,6 @@ fn failure(error: DatasetError) -> Failure {
         DatasetError::NotEmpty(_) | DatasetError::NotAFolder(_) => Failure::usage(error),
         DatasetError::Write { .. } | DatasetError::Encode { .. } => Failure::other(error),
     }
-}
-
-fn progress_bar(frames: u64) -> ProgressBar {
-    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} pairs, {eta} left");
-    ProgressBar::new(frames).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
 }
 
 fn parse_range(text: &str) -> Result<[u64; 2], String> {

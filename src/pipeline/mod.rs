@@ -2,6 +2,8 @@
 
 mod driver;
 mod method;
+mod statistics;
 
 pub use driver::{Delivery, PipelineError, Settings, StageLatencies, run};
 pub use method::{DescribedPair, Method, StageTimes};
+pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};

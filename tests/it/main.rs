@@ -1,6 +1,6 @@
 //! The integration tests, in one binary.
 //!
-//! `cfg(test)` on each lets clippy know that helpers may unwrap too.
+//! A line of `cfg(test)` of its own on each lets clippy know that helpers may unwrap too.
 
 #[cfg(test)]
 mod evaluate;
@@ -8,11 +8,14 @@ mod evaluate;
 mod features;
 #[cfg(test)]
 mod frame_source;
-#[cfg(all(test, feature = "opencv"))]
+#[cfg(test)]
+#[cfg(feature = "opencv")]
 mod opencv;
-#[cfg(all(test, feature = "ipc"))]
+#[cfg(test)]
+#[cfg(feature = "ipc")]
 mod publication;
-#[cfg(all(test, feature = "ipc"))]
+#[cfg(test)]
+#[cfg(feature = "ipc")]
 mod python_client;
 #[cfg(test)]
 mod recordings;

@@ -1,0 +1,137 @@
+//! `visod replay`: a recording instead of cameras, through the same pipeline.
+
+use super::session::{Finished, Session, unwritable};
+use super::{Failure, summary};
+use crate::capture::{Dataset, ReadAhead, Realtime};
+use crate::config::Config;
+use crate::geometry::load_rig;
+use std::path::{Path, PathBuf};
+
+/// Run a recording through the pipeline instead of cameras.
+///
+/// DATASET is a folder in one of three layouts: visod's own (left/, right/, rig.toml), KITTI
+/// odometry (image_0/, image_1/, calib.txt, times.txt) or EuRoC (mav0/cam0, mav0/cam1). The same
+/// recording and configuration give the same output to the last bit, whatever the number of
+/// workers; therefore latencies are in the summary and in the messages, and `nan` in the CSV.
+#[derive(clap::Args)]
+#[command(
+    after_help = "Example: visod replay recording --odometry odometry.csv --report report.html"
+)]
+pub(crate) struct Args {
+    /// The recording's folder.
+    dataset: PathBuf,
+    /// Settings of the pipeline [default: what `config/visod.toml` shows].
+    #[arg(long, value_name = "FILE")]
+    config: Option<PathBuf>,
+    /// A calibration to use instead of the recording's own.
+    #[arg(long, value_name = "FILE")]
+    rig: Option<PathBuf>,
+    /// Write pose and motion with covariance, one row a pair.
+    #[arg(long, value_name = "F.csv")]
+    odometry: Option<PathBuf>,
+    /// Write the trajectory in TUM format.
+    #[arg(long, value_name = "F.txt")]
+    trajectory: Option<PathBuf>,
+    /// Write the run's figures as JSON: counts, latencies, processor time, memory.
+    #[arg(long, value_name = "F.json")]
+    summary: Option<PathBuf>,
+    /// Write a page with figures.
+    #[arg(long, value_name = "F.html")]
+    report: Option<PathBuf>,
+    /// As fast as it goes, or at the speed of the recording.
+    #[arg(long, value_enum, default_value_t = Pace::Max)]
+    pace: Pace,
+    /// Do not publish over shared memory.
+    #[arg(long)]
+    no_publish: bool,
+    /// Print the run's figures as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+#[derive(Clone, Copy, clap::ValueEnum)]
+enum Pace {
+    /// As fast as the machine can; no pair is dropped.
+    Max,
+    /// Each pair at its time.
+    Realtime,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    let config = match &args.config {
+        Some(file) => Config::load(file).map_err(Failure::usage)?,
+        None => Config::default(),
+    };
+    let rig = match args.rig.as_ref().or(config.rig.as_ref()) {
+        Some(file) => Some(load_rig(file).map_err(Failure::usage)?),
+        None => None,
+    };
+    let dataset =
+        Dataset::open_with(&args.dataset, rig, config.dataset.clone()).map_err(Failure::usage)?;
+    if dataset.nominal_times {
+        eprintln!(
+            "visod: warning: {} has no times: pairs are taken to be 0.1 s apart",
+            args.dataset.display()
+        );
+    }
+    let mut session = Session::new(config, dataset.rig.clone());
+    session.write_csv(args.odometry.as_deref())?;
+    session.write_trajectory(args.trajectory.as_deref())?;
+    if args.report.is_some() {
+        session.keep_rows();
+    }
+    if !args.no_publish {
+        publish(&mut session);
+    }
+    let source = ReadAhead::start(&dataset).map_err(Failure::other)?;
+    let finished = match args.pace {
+        Pace::Max => session.run(source),
+        Pace::Realtime => session.run(Realtime::new(source)),
+    }?;
+    if let Some(file) = &args.report {
+        let title = args.dataset.display().to_string();
+        summary::write_report(
+            file,
+            &finished.rows,
+            dataset.ground_truth.as_deref(),
+            &title,
+        )?;
+    }
+    conclude(args, &finished)
+}
+
+/// Writes and prints the summary. A recording of which nothing could be used is a failure.
+fn conclude(args: &Args, finished: &Finished) -> Result<(), Failure> {
+    let json = summary::to_json(&args.dataset, finished).map_err(Failure::other)?;
+    if let Some(file) = &args.summary {
+        std::fs::write(file, format!("{json}\n")).map_err(|e| unwritable(file, &e))?;
+    }
+    if args.json {
+        println!("{json}");
+    } else {
+        print!("{}", summary::to_text(finished));
+    }
+    let counts = &finished.figures.counts;
+    if counts.unusable == counts.pairs {
+        return Err(Failure::other(format!(
+            "{}: not one of {} pairs is usable; the first: {}",
+            Path::display(&args.dataset),
+            counts.pairs,
+            finished.first_unusable.as_deref().unwrap_or("no reason")
+        )));
+    }
+    Ok(())
+}
+
+/// Publishes if that is possible: a replay is of use without, too.
+#[cfg(feature = "ipc")]
+fn publish(session: &mut Session) {
+    if let Err(e) = session.publish() {
+        eprintln!("visod: warning: nothing is published: {e}");
+    }
+}
+
+#[cfg(not(feature = "ipc"))]
+fn publish(_: &mut Session) {
+    eprintln!("visod: warning: nothing is published: this visod was built without the feature ipc");
+}

