@@ -7,7 +7,9 @@ mod extrema;
 mod hessian;
 mod integral;
 mod orientation;
+mod patch;
 mod pyramid;
+mod simd;
 mod spread;
 pub mod surf;
 
