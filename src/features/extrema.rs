@@ -7,8 +7,9 @@
 //! one sample away is none. Only three rows of each layer are ever held.
 
 use super::Keypoint;
-use super::hessian::{Columns, Filter};
-use super::integral::IntegralImage;
+use super::hessian::{Combined, Filter};
+use super::integral::{IntegralImage, SortedColumns};
+use super::simd::widened;
 
 /// Samples that are looked at together before any of them is looked at closely.
 const GROUP: usize = 16;
@@ -24,10 +25,13 @@ pub(super) struct Search {
     pub threshold: f32,
 }
 
-/// The last three rows of determinants of every layer of an octave.
+/// The search with its working memory, above all the last three rows of determinants of every layer
+/// of an octave.
 #[derive(Debug, Default)]
 pub(super) struct Detector {
-    columns: Columns,
+    columns: SortedColumns,
+    combined: Combined,
+    candidates: Vec<usize>,
     filters: Vec<Filter>,
     samples: usize,
     determinants: Vec<f32>,
@@ -44,6 +48,7 @@ impl Detector {
         search: Search,
         keypoints: &mut Vec<Keypoint>,
     ) {
+        self.columns.begin(integral, search.octaves - 1);
         for octave in 0..search.octaves {
             self.filters.clear();
             let filters = (0..search.layers + 2).map(|layer| Filter::new(octave, layer));
@@ -51,6 +56,9 @@ impl Detector {
                 .extend(filters.take_while(|f| f.fits(integral)));
             if self.filters.len() < 3 {
                 break;
+            }
+            if octave > 0 {
+                self.columns.double_step(integral);
             }
             self.detect_in_octave(integral, search.threshold, octave, keypoints);
         }
@@ -71,7 +79,7 @@ impl Detector {
                 if filter.samples(integral, row) > 0 {
                     let start = (layer * 3 + row % 3) * self.samples;
                     let out = &mut self.determinants[start..][..self.samples];
-                    filter.respond(integral, row, &mut self.columns, out);
+                    filter.respond(integral, &self.columns, row, &mut self.combined, out);
                 }
             }
             let Some(centre) = row.checked_sub(1) else {
@@ -85,7 +93,7 @@ impl Detector {
 
     /// Searches row `centre` of a layer; the row below it is the last one computed.
     fn search_row(
-        &self,
+        &mut self,
         integral: &IntegralImage,
         threshold: f32,
         (octave, layer, centre): (u32, usize, usize),
@@ -97,113 +105,114 @@ impl Detector {
         if centre < margin || centre + margin >= rows || 2 * margin >= self.samples {
             return;
         }
-        let row =
-            |layer, row| &self.determinants[(layer * 3 + row % 3) * self.samples..][..self.samples];
-        let near: Neighbourhood =
-            std::array::from_fn(|l| std::array::from_fn(|r| row(layer + l - 1, centre + r - 1)));
-        candidates(
-            &near[1],
-            threshold,
-            margin..self.samples - margin,
-            |column| {
-                if !is_highest(&near, column) {
-                    return;
-                }
-                let Some(offset) = top_of_quadratic(&near, column) else {
-                    return;
-                };
+        let mut candidates = std::mem::take(&mut self.candidates);
+        candidates.clear();
+        let near = self.neighbourhood(layer, centre);
+        let columns = margin..self.samples - margin;
+        find_candidates(&near[1], threshold, columns, &mut candidates);
+        for &column in &candidates {
+            if !is_highest(&near, column) {
+                continue;
+            }
+            if let Some(offset) = top_of_quadratic(&near, column) {
                 let filter = &self.filters[layer];
-                let step = filter.step_px as f32;
-                let layer_step_px = (filter.size_px - self.filters[layer - 1].size_px) as f32;
-                let centre_px = |sample: usize| {
-                    (filter.step_px * sample) as f32 + (filter.step_px - 1) as f32 * 0.5
-                };
                 keypoints.push(Keypoint {
-                    x_px: centre_px(column) + offset[0] * step,
-                    y_px: centre_px(centre) + offset[1] * step,
-                    size_px: (filter.size_px as f32 + offset[2] * layer_step_px).round_ties_even(),
                     response: near[1][1][column],
                     octave: octave as i32,
                     laplacian: filter.laplacian_sign(integral, centre, column),
-                    ..Keypoint::default()
+                    ..self.place(layer, (column, centre), offset)
                 });
-            },
-        );
+            }
+        }
+        self.candidates = candidates;
+    }
+
+    /// The rows around row `centre` of `layer`.
+    fn neighbourhood(&self, layer: usize, centre: usize) -> Neighbourhood<'_> {
+        let row = |layer: usize, row: usize| {
+            &self.determinants[(layer * 3 + row % 3) * self.samples..][..self.samples]
+        };
+        std::array::from_fn(|l| std::array::from_fn(|r| row(layer + l - 1, centre + r - 1)))
+    }
+
+    /// Place and size of the keypoint `offset` samples from sample `(column, row)` of `layer`.
+    fn place(&self, layer: usize, (column, row): (usize, usize), offset: [f32; 3]) -> Keypoint {
+        let filter = &self.filters[layer];
+        let step_px = filter.step_px as f32;
+        let layer_step_px = (filter.size_px - self.filters[layer - 1].size_px) as f32;
+        // The middle of the filter, which has an even number of pixels from the second octave on.
+        let middle_px = |sample: usize| (sample as f32 + 0.5) * step_px - 0.5;
+        Keypoint {
+            x_px: middle_px(column) + offset[0] * step_px,
+            y_px: middle_px(row) + offset[1] * step_px,
+            size_px: (filter.size_px as f32 + offset[2] * layer_step_px).round_ties_even(),
+            ..Keypoint::default()
+        }
     }
 
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
-        self.columns.capacity() + self.filters.capacity() + self.determinants.capacity()
+        self.columns.capacity()
+            + self.combined.capacity()
+            + self.candidates.capacity()
+            + self.filters.capacity()
+            + self.determinants.capacity()
     }
 }
 
-/// Calls `found` for every column that exceeds the threshold and its four nearest neighbours.
-fn candidates(
-    rows: &[&[f32]; 3],
-    threshold: f32,
-    columns: std::ops::Range<usize>,
-    found: impl FnMut(usize),
-) {
-    #[cfg(target_arch = "x86_64")]
-    if std::is_x86_feature_detected!("avx2") {
-        // SAFETY: the processor has AVX2, as just asked.
-        unsafe { candidates_avx2(rows, threshold, columns, found) };
-        return;
-    }
-    candidates_anywhere(rows, threshold, columns, found);
-}
-
-/// [`candidates_anywhere`] compiled for wider registers.
-#[cfg(target_arch = "x86_64")]
-#[target_feature(enable = "avx2")]
-fn candidates_avx2(
-    rows: &[&[f32]; 3],
-    threshold: f32,
-    columns: std::ops::Range<usize>,
-    found: impl FnMut(usize),
-) {
-    candidates_anywhere(rows, threshold, columns, found);
+widened! {
+    /// Appends every column that exceeds the threshold and its four nearest neighbours to `found`.
+    fn find_candidates = find_candidates_narrow, (
+        rows: &[&[f32]; 3],
+        threshold: f32,
+        columns: std::ops::Range<usize>,
+        found: &mut Vec<usize>,
+    )
 }
 
 #[inline(always)]
-fn candidates_anywhere(
+fn find_candidates_narrow(
     rows: &[&[f32]; 3],
     threshold: f32,
     columns: std::ops::Range<usize>,
-    mut found: impl FnMut(usize),
+    found: &mut Vec<usize>,
 ) {
-    let (start, len) = (columns.start, columns.len());
     let [above, here, below] = rows;
-    let is_candidate = |v: f32, neighbours: [f32; 4]| {
-        // No short circuit: a whole group goes through without a branch.
-        neighbours
-            .iter()
-            .fold(v > threshold, |all, &n| all & (v > n))
-    };
-    let neighbours = |at: usize| [here[at - 1], here[at + 1], above[at], below[at]];
-    let mut group_start = start;
-    let groups = here[start..][..len]
-        .chunks_exact(GROUP)
-        .zip(here[start - 1..].chunks_exact(GROUP))
-        .zip(here[start + 1..].chunks_exact(GROUP))
-        .zip(above[start..].chunks_exact(GROUP))
-        .zip(below[start..].chunks_exact(GROUP));
-    for ((((v, left), right), up), down) in groups {
+    // No short circuit: a whole group goes through without a branch.
+    let mut at = columns.start;
+    while at + GROUP <= columns.end {
+        let (v, left, right) = (
+            &here[at..][..GROUP],
+            &here[at - 1..][..GROUP],
+            &here[at + 1..][..GROUP],
+        );
+        let (up, down) = (&above[at..][..GROUP], &below[at..][..GROUP]);
         let mut any = false;
         for t in 0..GROUP {
-            any |= is_candidate(v[t], [left[t], right[t], up[t], down[t]]);
+            any |= (v[t] > threshold)
+                & (v[t] > left[t])
+                & (v[t] > right[t])
+                & (v[t] > up[t])
+                & (v[t] > down[t]);
         }
         if any {
-            (group_start..group_start + GROUP)
-                .filter(|&at| is_candidate(here[at], neighbours(at)))
-                .for_each(&mut found);
+            found.extend((at..at + GROUP).filter(|&c| is_candidate(rows, threshold, c)));
         }
-        group_start += GROUP;
+        at += GROUP;
     }
-    (group_start..columns.end)
-        .filter(|&at| is_candidate(here[at], neighbours(at)))
-        .for_each(found);
+    found.extend((at..columns.end).filter(|&c| is_candidate(rows, threshold, c)));
+}
+
+/// Whether the sample exceeds the threshold and its four nearest neighbours.
+#[inline(always)]
+fn is_candidate([above, here, below]: &[&[f32]; 3], threshold: f32, column: usize) -> bool {
+    let value = here[column];
+    value > threshold
+        && value > here[column - 1]
+        && value > here[column + 1]
+        && value > above[column]
+        && value > below[column]
 }
 
 /// Whether the sample exceeds its 26 neighbours.

@@ -19,7 +19,8 @@
 //! instead of thirty-two, every one of them along contiguous memory. Up to the last
 //! multiplications all is in integers, so no order of summation can change a bit.
 
-use super::integral::IntegralImage;
+use super::integral::{IntegralImage, SortedColumns};
+use super::simd::widened;
 
 /// How much the mixed derivative counts: the boxes' norm ratio of Bay et al., equation 4, squared.
 const MIXED_WEIGHT: f32 = 0.81;
@@ -41,30 +42,21 @@ pub(super) struct Filter {
     per_mixed_area: f32,
 }
 
-/// The working memory of [`Filter::respond`].
+/// The working memory of [`Filter::respond`]: one row of integral rows combined with the vertical
+/// weights of D_xx, D_yy and D_xy.
 #[derive(Debug, Default)]
-pub(super) struct Columns {
-    /// One row of integral rows combined with the vertical weights of D_xx, D_yy and D_xy.
-    combined: [Vec<i32>; 3],
-    /// The same with every `step_px`-th column side by side.
-    sorted: [Vec<i32>; 3],
-}
+pub(super) struct Combined([Vec<i32>; 3]);
 
-impl Columns {
+impl Combined {
     /// Makes room for rows of `len` sums.
-    fn reserve(&mut self, len: usize, step: usize) {
-        self.combined.iter_mut().for_each(|row| row.resize(len, 0));
-        let sorted_len = len.div_ceil(step) * step;
-        self.sorted.iter_mut().for_each(|row| {
-            row.resize(if step == 1 { 0 } else { sorted_len }, 0);
-        });
+    fn reserve(&mut self, len: usize) {
+        self.0.iter_mut().for_each(|row| row.resize(len, 0));
     }
 
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
-        let rows = self.combined.iter().chain(&self.sorted);
-        rows.map(Vec::capacity).sum()
+        self.0.iter().map(Vec::capacity).sum()
     }
 }
 
@@ -88,17 +80,20 @@ impl Filter {
     }
 
     /// How many samples from the border the first complete one lies.
+    #[inline]
     pub(super) fn margin(&self) -> usize {
         self.taps / 2
     }
 
     /// Whether the filter fits into the image at all.
+    #[inline]
     pub(super) fn fits(&self, integral: &IntegralImage) -> bool {
         self.size_px <= integral.width() && self.size_px <= integral.height()
     }
 
     /// How many samples of row `row` are complete; where it is none, the filter reaches beyond the
     /// image's upper or lower border there.
+    #[inline]
     pub(super) fn samples(&self, integral: &IntegralImage, row: usize) -> usize {
         let complete = self.fits(integral)
             && row >= self.margin()
@@ -111,97 +106,27 @@ impl Filter {
     }
 
     /// The determinants of row `row`, which has [`Self::samples`], to the samples of `out` from
-    /// [`Self::margin`] on.
+    /// [`Self::margin`] on. The columns are sorted by this filter's step.
     pub(super) fn respond(
         &self,
         integral: &IntegralImage,
+        columns: &SortedColumns,
         row: usize,
-        columns: &mut Columns,
+        combined: &mut Combined,
         out: &mut [f32],
     ) {
-        #[cfg(target_arch = "x86_64")]
-        if std::is_x86_feature_detected!("avx2") {
-            // SAFETY: the processor has AVX2, as just asked.
-            unsafe { self.respond_avx2(integral, row, columns, out) };
-            return;
-        }
-        self.respond_anywhere(integral, row, columns, out);
-    }
-
-    /// [`Self::respond_anywhere`] compiled for wider registers: the same operations on the same
-    /// numbers, hence the same bits.
-    #[cfg(target_arch = "x86_64")]
-    #[target_feature(enable = "avx2")]
-    fn respond_avx2(
-        &self,
-        integral: &IntegralImage,
-        row: usize,
-        columns: &mut Columns,
-        out: &mut [f32],
-    ) {
-        self.respond_anywhere(integral, row, columns, out);
-    }
-
-    #[inline(always)]
-    fn respond_anywhere(
-        &self,
-        integral: &IntegralImage,
-        row: usize,
-        columns: &mut Columns,
-        out: &mut [f32],
-    ) {
-        let samples = self.samples(integral, row);
+        debug_assert_eq!(columns.step(), self.step_px);
+        let out = &mut out[self.margin()..][..self.samples(integral, row)];
         let top = (row - self.margin()) * self.step_px;
-        let sums: [&[i32]; 10] = std::array::from_fn(|n| integral.row(top + self.ninth_px[n]));
-        columns.reserve(integral.width() + 1, self.step_px);
-        let [xx, yy, xy] = &mut columns.combined;
-        difference([sums[2], sums[7]], xx);
-        second_difference([sums[0], sums[3], sums[6], sums[9]], yy);
-        mixed_difference([sums[1], sums[4], sums[5], sums[8]], xy);
-        if self.step_px > 1 {
-            for (from, to) in columns.combined.iter().zip(&mut columns.sorted) {
-                sort_columns(self.step_px, from, to);
-            }
-        }
-        let [xx, yy, xy] = if self.step_px > 1 {
-            &columns.sorted
-        } else {
-            &columns.combined
-        };
-        let at = |row, n| self.samples_at(row, n, samples);
-        self.determinants(
-            [at(xx, 0), at(xx, 3), at(xx, 6), at(xx, 9)],
-            [at(yy, 2), at(yy, 7)],
-            [at(xy, 1), at(xy, 4), at(xy, 5), at(xy, 8)],
-            &mut out[self.margin()..][..samples],
+        let rows = self.ninth_px.map(|y| columns.row(integral, top + y));
+        combined.reserve(rows[0].len());
+        respond(
+            self,
+            &rows,
+            self.ninth_px.map(|x| columns.place(x)),
+            &mut combined.0,
+            out,
         );
-    }
-
-    /// The entries `ninth_px[n] + step_px * j` of a row with sorted columns, for `samples` of `j`.
-    #[inline(always)]
-    fn samples_at<'a>(&self, sorted: &'a [i32], n: usize, samples: usize) -> &'a [i32] {
-        let offset = self.ninth_px[n];
-        let run = sorted.len() / self.step_px;
-        &sorted[offset % self.step_px * run + offset / self.step_px..][..samples]
-    }
-
-    #[inline(always)]
-    fn determinants(&self, xx: [&[i32]; 4], yy: [&[i32]; 2], xy: [&[i32]; 4], out: &mut [f32]) {
-        let len = out.len();
-        let (xx, yy, xy) = (
-            xx.map(|s| &s[..len]),
-            yy.map(|s| &s[..len]),
-            xy.map(|s| &s[..len]),
-        );
-        for j in 0..len {
-            let sum_xx = second(xx[0][j], xx[1][j], xx[2][j], xx[3][j]);
-            let sum_yy = yy[1][j].wrapping_sub(yy[0][j]);
-            let sum_xy = mixed(xy[0][j], xy[1][j], xy[2][j], xy[3][j]);
-            let d_xx = sum_xx as f32 * self.per_area;
-            let d_yy = sum_yy as f32 * self.per_area;
-            let d_xy = sum_xy as f32 * self.per_mixed_area;
-            out[j] = d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy;
-        }
     }
 
     /// The Laplacian's sign at sample `(row, column)`: +1 for a dark blob, −1 for a light one.
@@ -215,6 +140,42 @@ impl Filter {
         let strip = |y: usize| rows[y][n[7]].wrapping_sub(rows[y][n[2]]);
         let sum_yy = second(strip(0), strip(3), strip(6), strip(9));
         (i64::from(sum_xx) + i64::from(sum_yy)).signum() as i8
+    }
+}
+
+widened! {
+    /// Determinants from the ten integral rows at a filter's ninths and the places of the columns at
+    /// them.
+    fn respond = respond_narrow, (
+        filter: &Filter,
+        rows: &[&[i32]; 10],
+        places: [usize; 10],
+        combined: &mut [Vec<i32>; 3],
+        out: &mut [f32],
+    )
+}
+
+#[inline(always)]
+fn respond_narrow(
+    filter: &Filter,
+    rows: &[&[i32]; 10],
+    places: [usize; 10],
+    combined: &mut [Vec<i32>; 3],
+    out: &mut [f32],
+) {
+    let [xx, yy, xy] = combined;
+    difference([rows[2], rows[7]], xx);
+    second_difference([rows[0], rows[3], rows[6], rows[9]], yy);
+    mixed_difference([rows[1], rows[4], rows[5], rows[8]], xy);
+    let len = out.len();
+    let [x0, x3, x6, x9] = [0, 3, 6, 9].map(|n| &xx[places[n]..][..len]);
+    let [y2, y7] = [2, 7].map(|n| &yy[places[n]..][..len]);
+    let [m1, m4, m5, m8] = [1, 4, 5, 8].map(|n| &xy[places[n]..][..len]);
+    for j in 0..len {
+        let d_xx = second(x0[j], x3[j], x6[j], x9[j]) as f32 * filter.per_area;
+        let d_yy = y7[j].wrapping_sub(y2[j]) as f32 * filter.per_area;
+        let d_xy = mixed(m1[j], m4[j], m5[j], m8[j]) as f32 * filter.per_mixed_area;
+        out[j] = d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy;
     }
 }
 
@@ -256,35 +217,6 @@ fn mixed_difference(from: [&[i32]; 4], to: &mut [i32]) {
     }
 }
 
-/// Brings the columns `p, p + step, p + 2 step, …` together, one run after the other for each `p`.
-#[inline(always)]
-fn sort_columns(step: usize, from: &[i32], to: &mut [i32]) {
-    let run = to.len() / step;
-    match step {
-        2 => sort_columns_by::<2>(run, from, to),
-        4 => sort_columns_by::<4>(run, from, to),
-        _ => {
-            for (p, to) in to.chunks_exact_mut(run).enumerate() {
-                let column = from.iter().skip(p).step_by(step);
-                to.iter_mut().zip(column).for_each(|(t, &f)| *t = f);
-            }
-        }
-    }
-}
-
-/// [`sort_columns`] for a step known to the compiler.
-#[inline(always)]
-fn sort_columns_by<const STEP: usize>(run: usize, from: &[i32], to: &mut [i32]) {
-    let (groups, rest) = from.as_chunks::<STEP>();
-    for p in 0..STEP {
-        let to = &mut to[p * run..][..run];
-        to.iter_mut().zip(groups).for_each(|(t, f)| *t = f[p]);
-        if let (Some(last), Some(&value)) = (to.last_mut(), rest.get(p)) {
-            *last = value;
-        }
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -315,14 +247,15 @@ mod tests {
         let image = noise(131, 97);
         let mut integral = IntegralImage::default();
         integral.compute(&image);
-        let mut columns = Columns::default();
+        let mut combined = Combined::default();
         for (octave, layer) in (0..4).flat_map(|o| (0..5).map(move |l| (o, l))) {
             let filter = Filter::new(octave, layer);
+            let columns = sorted(&integral, octave);
             for row in 0..97 >> octave {
                 let samples = filter.samples(&integral, row);
                 let mut out = vec![f32::NAN; 131];
                 if samples > 0 {
-                    filter.respond(&integral, row, &mut columns, &mut out);
+                    filter.respond(&integral, &columns, row, &mut combined, &mut out);
                 }
                 for j in (0..samples).step_by(3) {
                     let top = (row - filter.margin()) * filter.step_px;
@@ -344,20 +277,27 @@ mod tests {
         }
     }
 
+    fn sorted(integral: &IntegralImage, octave: u32) -> SortedColumns {
+        let mut columns = SortedColumns::default();
+        columns.begin(integral, octave);
+        (0..octave).for_each(|_| columns.double_step(integral));
+        columns
+    }
+
     #[test]
     fn wider_registers_give_the_same_bits() {
         let image = noise(301, 97);
         let mut integral = IntegralImage::default();
         integral.compute(&image);
-        let mut columns = Columns::default();
-        for (octave, layer) in (0..4).flat_map(|o| (0..5).map(move |l| (o, l))) {
-            let filter = Filter::new(octave, layer);
-            for row in (0..97 >> octave).filter(|&row| filter.samples(&integral, row) > 0) {
-                let (mut wide, mut plain) = (vec![0.0; 301], vec![0.0; 301]);
-                filter.respond(&integral, row, &mut columns, &mut wide);
-                filter.respond_anywhere(&integral, row, &mut columns, &mut plain);
-                assert_eq!(wide, plain);
-            }
+        for layer in 0..5 {
+            let filter = Filter::new(0, layer);
+            let rows = filter.ninth_px.map(|y| integral.row(y));
+            let samples = filter.samples(&integral, filter.margin());
+            let (mut wide, mut narrow) = (vec![0.0; samples], vec![1.0; samples]);
+            let mut combined = [(); 3].map(|()| vec![0; 302]);
+            respond(&filter, &rows, filter.ninth_px, &mut combined, &mut wide);
+            respond_narrow(&filter, &rows, filter.ninth_px, &mut combined, &mut narrow);
+            assert_eq!(wide, narrow);
         }
     }
 
@@ -376,7 +316,14 @@ mod tests {
         integral.compute(&image);
         let filter = Filter::new(0, 2);
         let mut out = vec![0.0; 5000];
-        filter.respond(&integral, 3500, &mut Columns::default(), &mut out);
+        let columns = sorted(&integral, 0);
+        filter.respond(
+            &integral,
+            &columns,
+            3500,
+            &mut Combined::default(),
+            &mut out,
+        );
         assert!(out[4500] > 1000.0);
         assert!(out[10..4400].iter().all(|&v| v == 0.0));
         assert_eq!(filter.laplacian_sign(&integral, 3500, 4500), 1);

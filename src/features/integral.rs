@@ -19,14 +19,16 @@ impl IntegralImage {
         let width = image.width() as usize;
         let stride = width + 1;
         self.stride = stride;
-        self.sums.clear();
         self.sums.resize(stride * (image.height() as usize + 1), 0);
+        self.sums[..stride].fill(0);
         if width == 0 {
+            self.sums.fill(0);
             return;
         }
         let rows = image.pixels().chunks_exact(width).enumerate();
         for (y, pixels) in rows {
             let (above, below) = self.sums[y * stride..].split_at_mut(stride);
+            below[0] = 0;
             let mut row_sum = 0_i32;
             let corners = below[1..stride].iter_mut().zip(&above[1..]);
             for ((sum, &sum_above), &pixel) in corners.zip(pixels) {
@@ -37,16 +39,19 @@ impl IntegralImage {
     }
 
     /// Columns of the image.
+    #[inline]
     pub(super) fn width(&self) -> usize {
         self.stride - 1
     }
 
     /// Rows of the image.
+    #[inline]
     pub(super) fn height(&self) -> usize {
         self.sums.len() / self.stride - 1
     }
 
     /// The `width() + 1` sums of the corners above pixel row `y`, for `y` from 0 to `height()`.
+    #[inline]
     pub(super) fn row(&self, y: usize) -> &[i32] {
         &self.sums[y * self.stride..][..self.stride]
     }
@@ -55,6 +60,80 @@ impl IntegralImage {
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
         self.sums.capacity()
+    }
+}
+
+/// An integral image with its columns sorted by their remainder by `step`: first the columns 0,
+/// `step`, `2 step`, …, then 1, `step + 1`, …, so that every `step`-th column is contiguous.
+#[derive(Debug, Default)]
+pub(super) struct SortedColumns {
+    step: usize,
+    row_len: usize,
+    sums: Vec<i32>,
+    row: Vec<i32>,
+}
+
+impl SortedColumns {
+    /// Takes the columns of `integral` as they are: a step of 1. They are copied at the first
+    /// [`Self::double_step`] only; `steps` is how many of these there will be at most.
+    pub(super) fn begin(&mut self, integral: &IntegralImage, steps: u32) {
+        self.step = 1;
+        self.row_len = integral.stride.next_multiple_of(1 << steps);
+        self.row.resize(self.row_len, 0);
+    }
+
+    /// Doubles the step.
+    pub(super) fn double_step(&mut self, integral: &IntegralImage) {
+        let run = self.row_len / self.step;
+        self.sums.resize(self.row_len * (integral.height() + 1), 0);
+        for (y, sums) in self.sums.chunks_exact_mut(self.row_len).enumerate() {
+            if self.step == 1 {
+                let (columns, padding) = self.row.split_at_mut(integral.stride);
+                columns.copy_from_slice(integral.row(y));
+                padding.fill(0);
+            } else {
+                self.row.copy_from_slice(sums);
+            }
+            let (even, odd) = sums.split_at_mut(self.row_len / 2);
+            let runs = self.row.chunks_exact(run);
+            let halves = even
+                .chunks_exact_mut(run / 2)
+                .zip(odd.chunks_exact_mut(run / 2));
+            for (run, (even, odd)) in runs.zip(halves) {
+                for ((pair, even), odd) in run.as_chunks::<2>().0.iter().zip(even).zip(odd) {
+                    [*even, *odd] = *pair;
+                }
+            }
+        }
+        self.step *= 2;
+    }
+
+    /// Distance of columns that are contiguous.
+    #[inline]
+    pub(super) fn step(&self) -> usize {
+        self.step
+    }
+
+    /// The sorted sums of the corners above pixel row `y`.
+    #[inline]
+    pub(super) fn row<'a>(&'a self, integral: &'a IntegralImage, y: usize) -> &'a [i32] {
+        if self.step == 1 {
+            integral.row(y)
+        } else {
+            &self.sums[y * self.row_len..][..self.row_len]
+        }
+    }
+
+    /// Where column `x` stands in a row; the columns `x + step`, `x + 2 step`, … follow it.
+    #[inline]
+    pub(super) fn place(&self, x: usize) -> usize {
+        x % self.step * (self.row_len / self.step) + x / self.step
+    }
+
+    /// Elements held.
+    #[cfg(test)]
+    pub(super) fn capacity(&self) -> usize {
+        self.sums.capacity() + self.row.capacity()
     }
 }
 
@@ -83,6 +162,29 @@ mod tests {
                         .map(|&pixel| i32::from(pixel))
                         .sum();
                     prop_assert_eq!(integral.row(y as usize)[x], naive);
+                }
+            }
+        }
+    }
+    #[test]
+    fn sorted_columns_are_where_they_are_said_to_be() {
+        let pixels = (0..37_u32 * 5).map(|n| (n * n % 251) as u8).collect();
+        let image = GrayImage::from_vec(37, 5, pixels).unwrap_or_default();
+        let mut integral = IntegralImage::default();
+        integral.compute(&image);
+        let mut sorted = SortedColumns::default();
+        for _ in 0..2 {
+            sorted.begin(&integral, 3);
+            for octave in 0..4 {
+                assert_eq!(sorted.step(), 1 << octave);
+                for (x, y) in (0..=37).flat_map(|x| (0..=5).map(move |y| (x, y))) {
+                    let found = sorted.row(&integral, y)[sorted.place(x)];
+                    assert_eq!(found, integral.row(y)[x], "{octave} {x} {y}");
+                    let next = x + sorted.step();
+                    assert!(next > 37 || sorted.place(next) == sorted.place(x) + 1);
+                }
+                if octave < 3 {
+                    sorted.double_step(&integral);
                 }
             }
         }

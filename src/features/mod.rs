@@ -10,7 +10,9 @@ mod integral;
 #[cfg(feature = "opencv")]
 pub mod opencv;
 mod orientation;
+mod patch;
 mod pyramid;
+mod simd;
 mod spread;
 pub mod surf;
 

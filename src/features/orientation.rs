@@ -5,6 +5,7 @@
 //! one with the longest sum of gradients gives the direction (Bay et al., section 4.1).
 
 use super::integral::IntegralImage;
+use super::simd::{round_i32, widened};
 
 /// Radius of the disc in which gradients are taken, in units of the scale.
 const RADIUS: i32 = 6;
@@ -12,6 +13,8 @@ const RADIUS: i32 = 6;
 const WEIGHT_SIGMA: f64 = 2.5;
 /// Grid points in the disc.
 const POINTS: usize = 113;
+/// [`POINTS`] rounded up to full vector registers.
+const POINTS_PADDED: usize = POINTS.next_multiple_of(8);
 /// Directions apart of the sectors that are tried.
 const SECTOR_STEP_DEG: usize = 5;
 /// Sectors that are tried.
@@ -85,27 +88,46 @@ impl Compass {
         (x_px, y_px): (f32, f32),
         scale_px: f32,
     ) -> Option<Direction> {
-        let half = (2.0 * scale_px).round_ties_even() as usize;
+        let half = round_i32(2.0 * scale_px) as usize;
         let side = 2 * half;
         if side > integral.width() || side > integral.height() {
             return None;
         }
-        let (last_x, last_y) = (integral.width() - side, integral.height() - side);
+        let last = [integral.width() - side, integral.height() - side].map(|n| n as i32);
         let to_corner = (side as f32 - 1.0) * 0.5;
-        let (mut xs, mut ys) = ([0.0; POINTS], [0.0; POINTS]);
+        let mut gradients = Gradients::default();
         let mut len = 0;
         for &(dx, dy, weight) in &self.points {
-            let x = (x_px + dx * scale_px - to_corner).round_ties_even();
-            let y = (y_px + dy * scale_px - to_corner).round_ties_even();
-            if x < 0.0 || y < 0.0 || x >= last_x as f32 || y >= last_y as f32 {
+            let x = round_i32(x_px + dx * scale_px - to_corner);
+            let y = round_i32(y_px + dy * scale_px - to_corner);
+            if x < 0 || y < 0 || x >= last[0] || y >= last[1] {
                 continue;
             }
             let (gx, gy) = gradient(integral, x as usize, y as usize, half);
-            xs[len] = gx as f32 * weight;
-            ys[len] = gy as f32 * weight;
+            gradients.x[len] = gx as f32 * weight;
+            gradients.y[len] = gy as f32 * weight;
             len += 1;
         }
-        (len > 0).then(|| strongest_sector(&xs[..len], &ys[..len]))
+        (len > 0).then(|| {
+            let mut sum = [0.0; 2];
+            strongest_sector(&gradients, &mut sum);
+            Direction::of(sum[0], sum[1])
+        })
+    }
+}
+
+/// Weighted gradients; those behind the last are zero, which adds nothing to any sum.
+struct Gradients {
+    x: [f32; POINTS_PADDED],
+    y: [f32; POINTS_PADDED],
+}
+
+impl Default for Gradients {
+    fn default() -> Self {
+        Self {
+            x: [0.0; POINTS_PADDED],
+            y: [0.0; POINTS_PADDED],
+        }
     }
 }
 
@@ -133,13 +155,24 @@ fn gradient(integral: &IntegralImage, x: usize, y: usize, half: usize) -> (i32, 
     )
 }
 
-/// The direction of the longest sum of gradients within a sector.
-fn strongest_sector(xs: &[f32], ys: &[f32]) -> Direction {
+widened! {
+    /// The longest sum of gradients within a sector.
+    fn strongest_sector = strongest_sector_narrow, (gradients: &Gradients, sum: &mut [f32; 2])
+}
+
+#[inline(always)]
+fn strongest_sector_narrow(gradients: &Gradients, sum: &mut [f32; 2]) {
+    let mut degrees = [0; POINTS_PADDED];
+    for n in 0..POINTS_PADDED {
+        let angle_rad = angle_rad(gradients.x[n], gradients.y[n]);
+        degrees[n] = round_i32(angle_rad * const { 180.0 / std::f32::consts::PI });
+    }
     // Gradients by step of directions: all of it, and all but its first degree.
     let mut whole = [[0.0_f32; SECTORS + 2 * WHOLE_STEPS + 1]; 2];
     let mut open = [[0.0_f32; SECTORS]; 2];
-    for (&x, &y) in xs.iter().zip(ys) {
-        let degree = angle_rad(x, y).to_degrees().round_ties_even() as usize % 360;
+    for n in 0..POINTS_PADDED {
+        let (x, y) = (gradients.x[n], gradients.y[n]);
+        let degree = degrees[n] as usize % 360;
         let step = degree / SECTOR_STEP_DEG;
         let at = step + WHOLE_STEPS + 1;
         whole[0][at] += x;
@@ -149,42 +182,49 @@ fn strongest_sector(xs: &[f32], ys: &[f32]) -> Direction {
             open[1][step] += y;
         }
     }
-    let sums: [[f32; SECTORS]; 2] = std::array::from_fn(|axis| {
-        let wrapped = &mut whole[axis];
+    for wrapped in &mut whole {
         wrapped.copy_within(SECTORS..SECTORS + WHOLE_STEPS + 1, 0);
         wrapped.copy_within(
             WHOLE_STEPS + 1..2 * WHOLE_STEPS + 1,
             SECTORS + WHOLE_STEPS + 1,
         );
-        sector_sums(wrapped, &open[axis])
-    });
-    let mut best = (0.0, 0.0, 0.0);
-    for (&x, &y) in sums[0].iter().zip(&sums[1]) {
+    }
+    let (xs, ys) = (
+        sector_sums(&whole[0], &open[0]),
+        sector_sums(&whole[1], &open[1]),
+    );
+    let mut longest = 0.0;
+    for (&x, &y) in xs.iter().zip(&ys) {
         let square = x * x + y * y;
-        if square > best.0 {
-            best = (square, x, y);
+        if square > longest {
+            longest = square;
+            *sum = [x, y];
         }
     }
-    Direction::of(best.1, best.2)
 }
 
 /// For each step the sum over the sector around its first degree. `wrapped` begins
 /// `WHOLE_STEPS + 1` steps before the first.
+#[inline(always)]
 fn sector_sums(
     wrapped: &[f32; SECTORS + 2 * WHOLE_STEPS + 1],
     open: &[f32; SECTORS],
 ) -> [f32; SECTORS] {
-    let mut sums: [f32; SECTORS] =
-        std::array::from_fn(|step| open[(step + SECTORS - WHOLE_STEPS - 1) % SECTORS]);
+    let mut sums = [0.0; SECTORS];
+    let (first, last) = sums.split_at_mut(WHOLE_STEPS + 1);
+    first.copy_from_slice(&open[SECTORS - WHOLE_STEPS - 1..]);
+    last.copy_from_slice(&open[..SECTORS - WHOLE_STEPS - 1]);
     for lag in 1..=2 * WHOLE_STEPS + 1 {
-        let shifted = wrapped.get(lag..lag + SECTORS).unwrap_or(&[]);
-        sums.iter_mut().zip(shifted).for_each(|(sum, s)| *sum += s);
+        for step in 0..SECTORS {
+            sums[step] += wrapped[step + lag];
+        }
     }
     sums
 }
 
 /// The angle of `(x, y)`, rad in [0, 2π), to 1e-6: the arc tangent as the polynomial of least
 /// greatest error on [0, 1], so that every machine has the same bits.
+#[inline(always)]
 fn angle_rad(x: f32, y: f32) -> f32 {
     use std::f32::consts::{FRAC_PI_2, PI, TAU};
     const ODD: [f32; 8] = [
@@ -200,7 +240,10 @@ fn angle_rad(x: f32, y: f32) -> f32 {
     let (run, rise) = (x.abs(), y.abs());
     let ratio = run.min(rise) / run.max(rise).max(f32::MIN_POSITIVE);
     let square = ratio * ratio;
-    let sum = ODD.iter().rev().fold(0.0, |sum, c| sum * square + c);
+    let mut sum = 0.0;
+    for n in (0..ODD.len()).rev() {
+        sum = sum * square + ODD[n];
+    }
     let first_octant = ratio * sum;
     let quadrant = if rise > run {
         FRAC_PI_2 - first_octant
@@ -245,8 +288,11 @@ mod tests {
         // One unit gradient in a degree: a sector every 5° has it if it lies within ±29°.
         for degree in 0..360_usize {
             let (y, x) = (degree as f32).to_radians().sin_cos();
-            let best = strongest_sector(&[x], &[y]);
-            assert!((best.cos - x).abs() < 1e-6 && (best.sin - y).abs() < 1e-6);
+            let mut gradients = Gradients::default();
+            (gradients.x[70], gradients.y[70]) = (x, y);
+            let mut best = [0.0; 2];
+            strongest_sector(&gradients, &mut best);
+            assert_eq!(best, [x, y]);
         }
         let hit = |degree: usize, sector: usize| {
             let mut wrapped = [0.0; SECTORS + 2 * WHOLE_STEPS + 1];

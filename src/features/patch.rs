@@ -1,0 +1,321 @@
+//! Patch: a keypoint's surroundings in, turned and scaled to 21 × 21 cells, out.
+//!
+//! A cell is the mean of 2 × 2 interpolated samples of the pyramid's level that leaves it at most
+//! [`CELL_MAX_PX`] wide: a keypoint of any size costs the same.
+
+use super::Keypoint;
+use super::orientation::Direction;
+use super::pyramid::Pyramid;
+use super::simd::{round_i32, widened};
+use crate::image::GrayImage;
+
+/// Cells across the patch.
+pub(super) const CELLS: usize = 21;
+/// Samples across a cell.
+const SAMPLES_PER_CELL: usize = 2;
+/// Samples across the patch.
+const SAMPLES: usize = CELLS * SAMPLES_PER_CELL;
+/// [`SAMPLES`] rounded up to full vector registers.
+const SAMPLES_PADDED: usize = SAMPLES.next_multiple_of(8);
+/// Largest side of a cell in pixels of the level it is sampled from.
+const CELL_MAX_PX: f32 = 2.5;
+/// Row length of the window, px: a power of two above 21 · 2.5 · √2 + 4.
+const PITCH: usize = 128;
+/// The last index at which a sample may lie, all of whose bits are set.
+const LAST: usize = PITCH * PITCH - 1;
+/// Bits of a sample's place behind the point.
+const FRACTION_BITS: i32 = 15;
+
+/// A piece of a level. Each pixel has the one below it in its upper byte, so that the four pixels
+/// around a sample are two neighbours.
+type Window = [u16; LAST + 2];
+
+/// The means of the cells, times the samples in one.
+pub(super) type Cells = [[f32; CELLS]; CELLS];
+
+/// Takes patches from an image; holds the working memory.
+#[derive(Debug)]
+pub(super) struct Patch {
+    pyramid: Pyramid,
+    window: Box<Window>,
+    cells: Cells,
+}
+
+impl Patch {
+    pub(super) fn new() -> Self {
+        Self {
+            pyramid: Pyramid::default(),
+            window: Box::new([0; LAST + 2]),
+            cells: [[0.0; CELLS]; CELLS],
+        }
+    }
+
+    /// Prepares for another image.
+    pub(super) fn begin(&mut self) {
+        self.pyramid.clear();
+    }
+
+    /// The cells around `keypoint` of `image`, their rows along `direction`.
+    pub(super) fn take(
+        &mut self,
+        image: &GrayImage,
+        keypoint: &Keypoint,
+        direction: Direction,
+    ) -> &Cells {
+        // OpenCV's patch has a whole number of pixels.
+        let cells = CELLS as f32;
+        let mut cell_px = (cells * keypoint.size_px * (1.2 / 9.0)).floor().max(1.0) / cells;
+        let (mut x_px, mut y_px) = (keypoint.x_px, keypoint.y_px);
+        let mut level = 0;
+        while cell_px > CELL_MAX_PX {
+            // A level's pixel 0 has its centre between the pixels 0 and 1 of the level before.
+            (x_px, y_px) = (0.5 * x_px - 0.25, 0.5 * y_px - 0.25);
+            cell_px *= 0.5;
+            level += 1;
+        }
+        let reach_px = (0.5 * cells * cell_px * std::f32::consts::SQRT_2).ceil() as i32 + 1;
+        let (left, top) = (
+            x_px.floor() as i32 - reach_px,
+            y_px.floor() as i32 - reach_px,
+        );
+        let side = 2 * reach_px as usize + 2;
+        let image = self.pyramid.level(image, level);
+        copy_window(image, left, top, side, &mut self.window);
+        let centre_px = [x_px - left as f32, y_px - top as f32];
+        let spacing_px = cell_px / SAMPLES_PER_CELL as f32;
+        sample(
+            &self.window,
+            centre_px,
+            spacing_px,
+            direction,
+            &mut self.cells,
+        );
+        &self.cells
+    }
+
+    /// Elements held.
+    #[cfg(test)]
+    pub(super) fn capacity(&self) -> usize {
+        self.pyramid.capacity()
+    }
+}
+
+widened! {
+    /// Copies the square of `side` px with upper left corner `(left, top)` to `window`; what lies
+    /// outside the image is as the nearest pixel inside.
+    fn copy_window = copy_window_narrow, (
+        image: &GrayImage,
+        left: i32,
+        top: i32,
+        side: usize,
+        window: &mut Window,
+    )
+}
+
+#[inline(always)]
+fn copy_window_narrow(image: &GrayImage, left: i32, top: i32, side: usize, window: &mut Window) {
+    let (last_x, last_y) = (image.width() as i32 - 1, image.height() as i32 - 1);
+    let is_inside = left >= 0 && left + side as i32 - 1 <= last_x;
+    let rows = window.chunks_exact_mut(PITCH).take(side);
+    for (y, to) in (top..).zip(rows) {
+        let row = image.row(y.clamp(0, last_y) as u32);
+        let below = image.row((y + 1).clamp(0, last_y) as u32);
+        let to = &mut to[..side];
+        let pair = |pixel: u8, below: u8| u16::from(pixel) | u16::from(below) << 8;
+        if is_inside {
+            let (row, below) = (
+                &row[left as usize..][..side],
+                &below[left as usize..][..side],
+            );
+            for x in 0..side {
+                to[x] = pair(row[x], below[x]);
+            }
+        } else {
+            for (x, to) in (left..).zip(to) {
+                let x = x.clamp(0, last_x) as usize;
+                *to = pair(row[x], below[x]);
+            }
+        }
+    }
+}
+
+widened! {
+    /// Samples the window at `spacing_px` around `centre_px` and sums up the samples of each cell.
+    fn sample = sample_narrow, (
+        window: &Window,
+        centre_px: [f32; 2],
+        spacing_px: f32,
+        direction: Direction,
+        cells: &mut Cells,
+    )
+}
+
+#[inline(always)]
+fn sample_narrow(
+    window: &Window,
+    centre_px: [f32; 2],
+    spacing_px: f32,
+    direction: Direction,
+    cells: &mut Cells,
+) {
+    let Direction { cos, sin, .. } = direction;
+    // Sample (a, b) lies at across[b] + down[a].
+    let across = [line(0.0, spacing_px * cos), line(0.0, spacing_px * sin)];
+    let down = [
+        line(centre_px[0], -spacing_px * sin),
+        line(centre_px[1], spacing_px * cos),
+    ];
+    for (cell_row, cells) in cells.iter_mut().enumerate() {
+        let mut sums = [0.0; SAMPLES_PADDED];
+        for a in cell_row * SAMPLES_PER_CELL..(cell_row + 1) * SAMPLES_PER_CELL {
+            add_row(window, &across, [down[0][a], down[1][a]], &mut sums);
+        }
+        for (cell, samples) in cells.iter_mut().zip(sums.as_chunks::<SAMPLES_PER_CELL>().0) {
+            *cell = samples[0] + samples[1];
+        }
+    }
+}
+
+/// One coordinate of the samples of a row or a column, in 2⁻¹⁵ px.
+#[inline(always)]
+fn line(middle_px: f32, step_px: f32) -> [i32; SAMPLES_PADDED] {
+    const UNIT: f32 = (1 << FRACTION_BITS) as f32;
+    let mut line = [0; SAMPLES_PADDED];
+    for n in 0..SAMPLES_PADDED {
+        // The padding repeats the last: it is computed with, but counts for nothing.
+        let from_middle = n.min(SAMPLES - 1) as f32 - 0.5 * (SAMPLES as f32 - 1.0);
+        line[n] = round_i32((middle_px + from_middle * step_px) * UNIT);
+    }
+    line
+}
+
+/// Adds the interpolated samples of a row to `sums`.
+#[inline(always)]
+fn add_row(
+    window: &Window,
+    across: &[[i32; SAMPLES_PADDED]; 2],
+    [x0, y0]: [i32; 2],
+    sums: &mut [f32; SAMPLES_PADDED],
+) {
+    const FRACTION: i32 = (1 << FRACTION_BITS) - 1;
+    let mut places = [0_u32; SAMPLES_PADDED];
+    let (mut right, mut low) = ([0.0_f32; SAMPLES_PADDED], [0.0_f32; SAMPLES_PADDED]);
+    for b in 0..SAMPLES_PADDED {
+        let (x, y) = (x0 + across[0][b], y0 + across[1][b]);
+        places[b] = ((y >> FRACTION_BITS) * PITCH as i32 + (x >> FRACTION_BITS)) as u32;
+        right[b] = (x & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
+        low[b] = (y & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
+    }
+    let mut quads = [0_u32; SAMPLES_PADDED];
+    for b in 0..SAMPLES {
+        // The mask never changes a place: it tells the compiler that it lies in the window.
+        let place = places[b] as usize & LAST;
+        quads[b] = u32::from(window[place]) | u32::from(window[place + 1]) << 16;
+    }
+    for b in 0..SAMPLES_PADDED {
+        let pixel = |byte: u32| ((quads[b] >> (8 * byte)) & 0xff) as i32 as f32;
+        let above = pixel(0) + (pixel(2) - pixel(0)) * right[b];
+        let below = pixel(1) + (pixel(3) - pixel(1)) * right[b];
+        sums[b] += above + (below - above) * low[b];
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A plane of grey values, which interpolation reproduces.
+    fn plane(x: f32, y: f32) -> f32 {
+        40.0 + x + 0.5 * y
+    }
+
+    #[test]
+    fn cells_of_a_plane_are_its_values_at_their_centres() {
+        let pixels = (0..150 * 100).map(|n| plane((n % 150) as f32, (n / 150 * 2) as f32 * 0.5));
+        let pixels = pixels.map(|p| p as u8).collect();
+        let image = GrayImage::from_vec(150, 100, pixels).unwrap_or_default();
+        let mut patch = Patch::new();
+        for (size_px, degree) in [
+            (15.0_f32, 0.0_f32),
+            (15.0, 33.0),
+            (18.0, 200.0),
+            (24.0, 300.0),
+        ] {
+            let (sin, cos) = degree.to_radians().sin_cos();
+            let direction = Direction {
+                angle_rad: degree.to_radians(),
+                cos,
+                sin,
+            };
+            let keypoint = Keypoint {
+                x_px: 75.3,
+                y_px: 49.6,
+                size_px,
+                ..Keypoint::default()
+            };
+            patch.begin();
+            let cells = patch.take(&image, &keypoint, direction);
+            let cell_px = (size_px * 2.8 + 1e-4).floor() / 21.0;
+            for (row, column) in (0..21).flat_map(|row| (0..21).map(move |c| (row, c))) {
+                let (u, v) = (
+                    (column as f32 - 10.0) * cell_px,
+                    (row as f32 - 10.0) * cell_px,
+                );
+                let truth = plane(75.3 + u * cos - v * sin, 49.6 + u * sin + v * cos);
+                let found = cells[row][column] / 4.0;
+                assert!(
+                    (found - truth).abs() < 0.8,
+                    "{degree} {row} {column}: {found} {truth}"
+                );
+            }
+        }
+    }
+
+    #[test]
+    fn outside_the_image_is_its_border() {
+        let image = GrayImage::from_vec(2, 2, vec![10, 20, 30, 40]).unwrap_or_default();
+        let mut window = [0; LAST + 2];
+        copy_window(&image, -1, -1, 4, &mut window);
+        let rows: Vec<u16> = window
+            .chunks(PITCH)
+            .take(4)
+            .flat_map(|r| &r[..4])
+            .map(|p| p % 256)
+            .collect();
+        assert_eq!(
+            rows,
+            [
+                10, 10, 20, 20, 10, 10, 20, 20, 30, 30, 40, 40, 30, 30, 40, 40
+            ]
+        );
+        let below: Vec<u16> = window
+            .chunks(PITCH)
+            .take(4)
+            .flat_map(|r| &r[..4])
+            .map(|p| p / 256)
+            .collect();
+        assert_eq!(
+            below,
+            [
+                10, 10, 20, 20, 30, 30, 40, 40, 30, 30, 40, 40, 30, 30, 40, 40
+            ]
+        );
+    }
+
+    #[test]
+    fn wider_registers_give_the_same_bits() {
+        let mut window = [0; LAST + 2];
+        (0..)
+            .zip(&mut window)
+            .for_each(|(n, w): (u32, _)| *w = (n * n * 31 % 65_521) as u16);
+        let direction = Direction {
+            angle_rad: 1.0,
+            cos: 0.540_302_3,
+            sin: 0.841_471,
+        };
+        let (mut wide, mut narrow) = ([[0.0; CELLS]; CELLS], [[1.0; CELLS]; CELLS]);
+        sample(&window, [40.3, 39.6], 1.2, direction, &mut wide);
+        sample_narrow(&window, [40.3, 39.6], 1.2, direction, &mut narrow);
+        assert_eq!(wide, narrow);
+    }
+}
