@@ -1,5 +1,6 @@
 //! The command line: one file a command.
 
+mod demo;
 mod evaluate;
 mod features;
 mod listen;
@@ -23,6 +24,7 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Demo(demo::Args),
     Replay(replay::Args),
     Simulate(Box<simulate::Args>),
     Listen(listen::Args),
@@ -56,6 +58,7 @@ impl Failure {
 /// other failure.
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Demo(args) => demo::run(&args),
         Command::Replay(args) => replay::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Listen(args) => listen::run(&args),
