@@ -3,6 +3,7 @@
 mod evaluate;
 mod features;
 mod listen;
+mod report;
 mod rig;
 mod simulate;
 
@@ -19,9 +20,10 @@ struct Cli {
 
 #[derive(Subcommand)]
 enum Command {
+    Evaluate(evaluate::Args),
     Features(features::Args),
     Listen(listen::Args),
-    Evaluate(evaluate::Args),
+    Report(report::Args),
     Rig(rig::Args),
     Simulate(Box<simulate::Args>),
 }
@@ -51,9 +53,10 @@ impl Failure {
 /// other failure.
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
+        Command::Evaluate(args) => evaluate::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Listen(args) => listen::run(&args),
-        Command::Evaluate(args) => evaluate::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Rig(args) => rig::run(&args),
         Command::Simulate(args) => simulate::run(&args),
     };
