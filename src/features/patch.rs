@@ -73,14 +73,13 @@ impl Patch {
             cell_px *= 0.5;
             level += 1;
         }
-        let reach_px = (0.5 * cells * cell_px * std::f32::consts::SQRT_2).ceil() as i32 + 1;
-        let (left, top) = (
-            x_px.floor() as i32 - reach_px,
-            y_px.floor() as i32 - reach_px,
-        );
+        let extent = direction.cos.abs() + direction.sin.abs();
+        let reach_px = (0.5 * cells * cell_px * extent).ceil() as i32 + 1;
+        let left = x_px.floor() as i32 - reach_px;
+        let top = y_px.floor() as i32 - reach_px;
         let side = 2 * reach_px as usize + 2;
         let image = self.pyramid.level(image, level);
-        copy_window(image, left, top, side, &mut self.window);
+        copy_window(image, [left, top], side, &mut self.window);
         let centre_px = [x_px - left as f32, y_px - top as f32];
         let spacing_px = cell_px / SAMPLES_PER_CELL as f32;
         sample(
@@ -101,42 +100,49 @@ impl Patch {
 }
 
 widened! {
-    /// Copies the square of `side` px with upper left corner `(left, top)` to `window`; what lies
-    /// outside the image is as the nearest pixel inside.
+    /// Copies the square of `side` px, or somewhat more, with the given upper left corner to
+    /// `window`; what lies outside the image is as the nearest pixel inside.
     fn copy_window = copy_window_narrow, (
         image: &GrayImage,
-        left: i32,
-        top: i32,
+        corner: [i32; 2],
         side: usize,
         window: &mut Window,
     )
 }
 
 #[inline(always)]
-fn copy_window_narrow(image: &GrayImage, left: i32, top: i32, side: usize, window: &mut Window) {
+fn copy_window_narrow(image: &GrayImage, corner: [i32; 2], side: usize, window: &mut Window) {
+    let [left, top] = corner;
     let (last_x, last_y) = (image.width() as i32 - 1, image.height() as i32 - 1);
-    let is_inside = left >= 0 && left + side as i32 - 1 <= last_x;
+    // Whole registers, as far as the image goes.
+    let columns = side.next_multiple_of(16);
+    let is_inside = left >= 0 && left + columns as i32 - 1 <= last_x;
     let rows = window.chunks_exact_mut(PITCH).take(side);
     for (y, to) in (top..).zip(rows) {
         let row = image.row(y.clamp(0, last_y) as u32);
         let below = image.row((y + 1).clamp(0, last_y) as u32);
-        let to = &mut to[..side];
-        let pair = |pixel: u8, below: u8| u16::from(pixel) | u16::from(below) << 8;
         if is_inside {
-            let (row, below) = (
-                &row[left as usize..][..side],
-                &below[left as usize..][..side],
-            );
-            for x in 0..side {
-                to[x] = pair(row[x], below[x]);
+            let row = row[left as usize..][..columns].as_chunks::<16>().0;
+            let below = below[left as usize..][..columns].as_chunks::<16>().0;
+            let to = to[..columns].as_chunks_mut::<16>().0;
+            for ((to, row), below) in to.iter_mut().zip(row).zip(below) {
+                for x in 0..16 {
+                    to[x] = pair(row[x], below[x]);
+                }
             }
         } else {
-            for (x, to) in (left..).zip(to) {
+            for (x, to) in (left..).zip(&mut to[..side]) {
                 let x = x.clamp(0, last_x) as usize;
                 *to = pair(row[x], below[x]);
             }
         }
     }
+}
+
+/// A pixel and the one below it as the window holds them.
+#[inline(always)]
+fn pair(pixel: u8, below: u8) -> u16 {
+    u16::from(pixel) | u16::from(below) << 8
 }
 
 widened! {
@@ -275,7 +281,7 @@ mod tests {
     fn outside_the_image_is_its_border() {
         let image = GrayImage::from_vec(2, 2, vec![10, 20, 30, 40]).unwrap_or_default();
         let mut window = [0; LAST + 2];
-        copy_window(&image, -1, -1, 4, &mut window);
+        copy_window(&image, [-1, -1], 4, &mut window);
         let rows: Vec<u16> = window
             .chunks(PITCH)
             .take(4)

@@ -17,6 +17,9 @@ use crate::settings::SettingError;
 /// Scale of a filter in units of its size: 9 px approximate a Gaussian of σ 1.2 px.
 const SCALE_PER_SIZE: f32 = 1.2 / 9.0;
 
+/// Size of a keypoint that is to be removed.
+const DROPPED: f32 = 0.0;
+
 /// The knobs of [`Surf`].
 #[derive(Clone, Debug, PartialEq, serde::Deserialize, serde::Serialize)]
 #[serde(default, deny_unknown_fields)]
@@ -82,6 +85,7 @@ pub struct Surf {
     detector: Detector,
     spread: Spread,
     describer: Describer,
+    order: Vec<u32>,
 }
 
 impl Surf {
@@ -98,6 +102,7 @@ impl Surf {
             detector: Detector::default(),
             spread: Spread::default(),
             describer: Describer::new(),
+            order: Vec::new(),
         })
     }
 
@@ -105,30 +110,36 @@ impl Surf {
     /// they have no direction.
     fn describe(&mut self, image: &GrayImage, features: &mut Features) {
         let len = self.settings.descriptor_len();
-        let Features {
-            keypoints,
-            descriptor_len,
-            descriptors,
-        } = features;
-        *descriptor_len = len;
-        descriptors.resize(keypoints.len() * len, 0.0);
+        features.descriptor_len = len;
+        features.descriptors.resize(features.len() * len, 0.0);
         self.describer.begin();
-        let mut described = 0;
-        for n in 0..keypoints.len() {
-            let mut keypoint = keypoints[n];
-            let Some(direction) = self.direction(&keypoint) else {
+        self.order_by_place(&features.keypoints);
+        for n in 0..self.order.len() {
+            let n = self.order[n] as usize;
+            let keypoint = &mut features.keypoints[n];
+            let Some(direction) = self.direction(keypoint) else {
+                keypoint.size_px = DROPPED;
                 continue;
             };
             keypoint.angle_rad = direction.angle_rad;
             keypoint.sigma_px = self.settings.noise_per_scale * keypoint.size_px * SCALE_PER_SIZE;
-            let descriptor = &mut descriptors[described * len..][..len];
+            let descriptor = &mut features.descriptors[n * len..][..len];
             self.describer
-                .describe(image, &keypoint, direction, descriptor);
-            keypoints[described] = keypoint;
-            described += 1;
+                .describe(image, keypoint, direction, descriptor);
         }
-        keypoints.truncate(described);
-        descriptors.truncate(described * len);
+        remove_dropped(features);
+    }
+
+    /// Fills `order` with the indices of the keypoints, band by band of the image, so that
+    /// neighbours follow one another and find their pixels in the cache.
+    fn order_by_place(&mut self, keypoints: &[Keypoint]) {
+        const BAND_PX: f32 = 32.0;
+        self.order.clear();
+        self.order.extend(0..keypoints.len() as u32);
+        self.order.sort_unstable_by_key(|&n| {
+            let keypoint = &keypoints[n as usize];
+            ((keypoint.y_px / BAND_PX) as u32, keypoint.x_px as u32, n)
+        });
     }
 
     fn direction(&self, keypoint: &Keypoint) -> Option<Direction> {
@@ -147,6 +158,7 @@ impl Surf {
             + self.detector.capacity()
             + self.spread.capacity()
             + self.describer.capacity()
+            + self.order.capacity()
     }
 }
 
@@ -167,6 +179,26 @@ impl Extractor for Surf {
         self.describe(image, features);
         Ok(())
     }
+}
+
+/// Removes the keypoints of size [`DROPPED`] with their descriptors; the others keep their order.
+fn remove_dropped(features: &mut Features) {
+    let len = features.descriptor_len;
+    let mut kept = 0;
+    for n in 0..features.len() {
+        if features.keypoints[n].size_px == DROPPED {
+            continue;
+        }
+        if kept < n {
+            features.keypoints[kept] = features.keypoints[n];
+            features
+                .descriptors
+                .copy_within(n * len..(n + 1) * len, kept * len);
+        }
+        kept += 1;
+    }
+    features.keypoints.truncate(kept);
+    features.descriptors.truncate(kept * len);
 }
 
 #[cfg(test)]
