@@ -4,6 +4,11 @@
 //! weighted by a Gaussian of 2.5 s. Of all sectors of 60° of gradient directions, one every 5°, the
 //! one with the longest sum of gradients gives the direction (Bay et al., section 4.1).
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::integral::IntegralImage;
 use super::simd::{round_i32, widened};
 
@@ -242,8 +247,8 @@ fn angle_rad(x: f32, y: f32) -> f32 {
     let ratio = run.min(rise) / run.max(rise).max(f32::MIN_POSITIVE);
     let square = ratio * ratio;
     let mut sum = 0.0;
-    for n in (0..ODD.len()).rev() {
-        sum = sum * square + ODD[n];
+    for coefficient in ODD.iter().rev() {
+        sum = sum * square + coefficient;
     }
     let first_octant = ratio * sum;
     let quadrant = if rise > run {
@@ -304,7 +309,7 @@ mod tests {
                     *bin = 1.0;
                 }
             }
-            open[degree / 5] = if degree % 5 == 0 { 0.0 } else { 1.0 };
+            open[degree / 5] = if degree.is_multiple_of(5) { 0.0 } else { 1.0 };
             sector_sums(&wrapped, &open)[sector]
         };
         for degree in 0..360 {

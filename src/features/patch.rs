@@ -3,6 +3,11 @@
 //! A cell is the mean of 2 × 2 interpolated samples of the pyramid's level that leaves it at most
 //! [`CELL_MAX_PX`] wide: a keypoint of any size costs the same.
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::Keypoint;
 use super::orientation::Direction;
 use super::pyramid::Pyramid;
@@ -165,16 +170,16 @@ fn sample_narrow(
     cells: &mut Cells,
 ) {
     let Direction { cos, sin, .. } = direction;
-    // Sample (a, b) lies at across[b] + down[a].
+    // Sample (a, b) lies at across[·][b] + (down_x[a], down_y[a]).
     let across = [line(0.0, spacing_px * cos), line(0.0, spacing_px * sin)];
-    let down = [
-        line(centre_px[0], -spacing_px * sin),
-        line(centre_px[1], spacing_px * cos),
-    ];
-    for (cell_row, cells) in cells.iter_mut().enumerate() {
+    let down_x = line(centre_px[0], -spacing_px * sin);
+    let down_y = line(centre_px[1], spacing_px * cos);
+    let starts_x = down_x.as_chunks::<SAMPLES_PER_CELL>().0;
+    let starts_y = down_y.as_chunks::<SAMPLES_PER_CELL>().0;
+    for ((cells, x0), y0) in cells.iter_mut().zip(starts_x).zip(starts_y) {
         let mut sums = [0.0; SAMPLES_PADDED];
-        for a in cell_row * SAMPLES_PER_CELL..(cell_row + 1) * SAMPLES_PER_CELL {
-            add_row(window, &across, [down[0][a], down[1][a]], &mut sums);
+        for (&x0, &y0) in x0.iter().zip(y0) {
+            add_row(window, &across, [x0, y0], &mut sums);
         }
         for (cell, samples) in cells.iter_mut().zip(sums.as_chunks::<SAMPLES_PER_CELL>().0) {
             *cell = samples[0] + samples[1];

@@ -26,7 +26,8 @@ const DROPPED: f32 = 0.0;
 pub struct Settings {
     /// Determinant of the Hessian that a keypoint exceeds, grey values² / px⁴ as OpenCV scales it;
     /// 0 to 1e6, default 100. Low, so that images of little contrast have features too: the
-    /// budget keeps the strongest.
+    /// budget keeps the strongest. Between 50 and 100 three quarters of the keypoints were found
+    /// again under noise, above 1600 nineteen of twenty.
     pub hessian: f32,
     /// Octaves, each with half the samples of the one before; 1 to 8, default 4.
     pub octaves: u32,
@@ -38,7 +39,11 @@ pub struct Settings {
     pub upright: bool,
     /// Keypoints an image at most, spread evenly over it; 0 for all, default 1000.
     pub budget: usize,
-    /// σ of a keypoint's position per px of its scale (scale = size · 1.2 / 9); 0.001 to 10.
+    /// σ of a keypoint's position, in x and in y, in units of its scale (scale = size · 1.2 / 9);
+    /// 0.001 to 10, default 0.12. Half the width that holds 68 % of the differences between the
+    /// keypoints of five images and those of the same images shifted, turned, scaled and with
+    /// noise of 2 to 4 grey values was 0.17 scales, about the same for every scale; √2 less is one
+    /// keypoint's share.
     pub noise_per_scale: f32,
 }
 
@@ -51,7 +56,7 @@ impl Default for Settings {
             extended: false,
             upright: false,
             budget: 1000,
-            noise_per_scale: 0.1,
+            noise_per_scale: 0.12,
         }
     }
 }
