@@ -6,6 +6,7 @@ mod features;
 mod listen;
 mod progress;
 mod replay;
+mod report;
 mod rig;
 mod session;
 mod simulate;
@@ -34,6 +35,7 @@ enum Command {
     Simulate(Box<simulate::Args>),
     Listen(listen::Args),
     Evaluate(evaluate::Args),
+    Report(report::Args),
     Features(features::Args),
     Rig(rig::Args),
 }
@@ -68,6 +70,7 @@ pub fn main() -> ExitCode {
         Command::Simulate(args) => simulate::run(&args),
         Command::Listen(args) => listen::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
+        Command::Report(args) => report::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Rig(args) => rig::run(&args),
     };

@@ -2,6 +2,8 @@
 
 use super::Failure;
 use super::session::{Finished, unwritable};
+use crate::evaluation::{self, Trajectory};
+use crate::output::report;
 use crate::output::row::OdometryRow;
 use std::fmt::Write;
 use std::path::Path;
@@ -64,15 +66,43 @@ pub(crate) fn to_text(finished: &Finished) -> String {
     text
 }
 
-/// Writes the page with figures; the truth is shown where the recording has it.
+/// Writes the page with figures; the truth is shown where the recording has it and it can be read.
 pub(crate) fn write_report(
     file: &Path,
     rows: &[OdometryRow],
     ground_truth: Option<&Path>,
     title: &str,
 ) -> Result<(), Failure> {
-    let _ = (rows, ground_truth, title);
-    std::fs::write(file, "").map_err(|e| unwritable(file, &e))
+    let truth = ground_truth.and_then(|path| match true_poses(path) {
+        Ok(truth) => Some(truth),
+        Err(e) => {
+            eprintln!("visod: warning: the report goes without the truth: {e}");
+            None
+        }
+    });
+    let settings = evaluation::Settings::default();
+    let page = report::render(rows, truth.as_ref(), &settings, title).or_else(|e| {
+        eprintln!("visod: warning: the report goes without the truth: {e}");
+        report::render(rows, None, &settings, title)
+    });
+    let page = page.map_err(|e| Failure::other(format!("{}: {e}", file.display())))?;
+    std::fs::write(file, page).map_err(|e| unwritable(file, &e))
+}
+
+/// A recording's true poses, of its left camera: EuRoC's are those of the body, and the camera's
+/// place in it stands in the recording too.
+fn true_poses(path: &Path) -> Result<Trajectory, evaluation::FileError> {
+    let truth = evaluation::read_trajectory(path)?;
+    let sensor = path
+        .ancestors()
+        .nth(2)
+        .map(|mav0| mav0.join("cam0").join("sensor.yaml"));
+    match sensor {
+        Some(sensor) if path.ends_with("data.csv") && sensor.is_file() => {
+            Ok(truth.of_camera(&evaluation::read_body_from_camera(&sensor)?))
+        }
+        _ => Ok(truth),
+    }
 }
 
 fn position_m(row: &OdometryRow) -> [f64; 3] {

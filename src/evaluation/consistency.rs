@@ -5,9 +5,9 @@
 //! average; the motions are many samples, as far as they are independent, which their
 //! autocorrelation tells.
 
-use super::odometry_csv::OdometryRow;
 use crate::estimation::Status;
 use crate::geometry::se3::error_fixed_axes;
+use crate::output::row::OdometryRow;
 use crate::uncertainty::consistency::{
     anees_interval, autocorrelation, autocorrelation_limit, chi2_quantile, coverage,
     coverage_interval, nees, whiten,

@@ -2,8 +2,9 @@
 //! each of its rows.
 
 use super::file_error::{FileError, read_text};
-use super::odometry_csv::{OdometryRow, looks_like_odometry_csv, parse_odometry_csv};
 use super::trajectory::{Trajectory, parse_trajectory};
+use crate::output::csv::parse_odometry_csv;
+use crate::output::row::OdometryRow;
 use nalgebra::Isometry3;
 use std::path::Path;
 
@@ -59,10 +60,36 @@ pub enum AssociationError {
 pub fn read_estimate(path: &Path) -> Result<Estimate, FileError> {
     let text = read_text(path)?;
     if looks_like_odometry_csv(&text) {
-        parse_odometry_csv(path, &text).map(Estimate::Odometry)
+        parse_rows(path, &text).map(Estimate::Odometry)
     } else {
         parse_trajectory(path, &text).map(Estimate::Trajectory)
     }
+}
+
+/// Whether a text begins as an odometry CSV does.
+fn looks_like_odometry_csv(text: &str) -> bool {
+    let header = text.lines().next().unwrap_or("");
+    header.contains(',') && header.split(',').any(|name| name.trim() == "seq")
+}
+
+fn parse_rows(name: &Path, text: &str) -> Result<Vec<OdometryRow>, FileError> {
+    let rows = parse_odometry_csv(name, text.as_bytes()).map_err(|error| FileError {
+        line: error.line.and_then(|line| usize::try_from(line).ok()),
+        cause: match error.column {
+            Some(column) => format!("{column}: {}", error.cause),
+            None => error.cause,
+        },
+        file: error.file,
+    })?;
+    if rows.is_empty() {
+        return Err(FileError::new(name, None, "holds a header but no row"));
+    }
+    if let Some(pair) = rows.windows(2).find(|w| w[0].sequence >= w[1].sequence) {
+        let (before, after) = (pair[0].sequence, pair[1].sequence);
+        let cause = format!("seq must rise, but {after} follows {before}");
+        return Err(FileError::new(name, None, cause));
+    }
+    Ok(rows)
 }
 
 impl Estimate {

@@ -2,8 +2,8 @@
 //!
 //! | module | computes |
 //! |---|---|
-//! | [`trajectory`], [`odometry_csv`] | poses from files |
-//! | [`estimate`] | which true pose belongs to which row |
+//! | [`trajectory`] | poses from files |
+//! | [`estimate`] | the estimate, and which true pose belongs to which row of it |
 //! | [`segments`] | KITTI's drift in % and deg/m over lengths of path |
 //! | [`pose_errors`], [`alignment`] | absolute and relative pose errors |
 //! | [`consistency`] | whether the covariances hold |
@@ -12,7 +12,6 @@ pub mod alignment;
 pub mod consistency;
 pub mod estimate;
 mod file_error;
-pub mod odometry_csv;
 pub mod pose_errors;
 pub mod segments;
 mod sensor_yaml;
@@ -23,11 +22,11 @@ pub mod trajectory;
 pub use alignment::Alignment;
 pub use estimate::{AssociationError, Estimate, associate, read_estimate};
 pub use file_error::FileError;
-pub use odometry_csv::{OdometryRow, read_odometry_csv};
 pub use sensor_yaml::read_body_from_camera;
 pub use trajectory::{Trajectory, read_trajectory};
 
 use crate::estimation::Status;
+use crate::output::row::OdometryRow;
 use consistency::Consistency;
 use nalgebra::{Isometry3, Matrix6, Vector6};
 use pose_errors::{AbsoluteErrors, RelativeErrors, absolute_errors, relative_errors};

@@ -179,40 +179,45 @@ fn find_candidates_narrow(
     found: &mut Vec<usize>,
 ) {
     let [above, here, below] = rows;
-    // No short circuit: a whole group goes through without a branch.
     let mut at = columns.start;
     while at + GROUP <= columns.end {
-        let (v, left, right) = (
-            &here[at..][..GROUP],
+        let (left, v, right) = (
             &here[at - 1..][..GROUP],
+            &here[at..][..GROUP],
             &here[at + 1..][..GROUP],
         );
         let (up, down) = (&above[at..][..GROUP], &below[at..][..GROUP]);
-        let mut any = false;
+        // No branch until a whole group is done with.
+        let mut bar = [threshold; GROUP];
+        let mut hits = 0_u32;
         for t in 0..GROUP {
-            any |= (v[t] > threshold)
-                & (v[t] > left[t])
-                & (v[t] > right[t])
-                & (v[t] > up[t])
-                & (v[t] > down[t]);
+            bar[t] = higher(
+                higher(bar[t], higher(left[t], right[t])),
+                higher(up[t], down[t]),
+            );
+            hits |= u32::from(v[t] > bar[t]);
         }
-        if any {
-            found.extend((at..at + GROUP).filter(|&c| is_candidate(rows, threshold, c)));
+        if hits > 0 {
+            for t in 0..GROUP {
+                if v[t] > bar[t] {
+                    found.push(at + t);
+                }
+            }
         }
         at += GROUP;
     }
-    found.extend((at..columns.end).filter(|&c| is_candidate(rows, threshold, c)));
+    for at in at..columns.end {
+        let others = [here[at - 1], here[at + 1], above[at], below[at], threshold];
+        if others.iter().all(|&other| here[at] > other) {
+            found.push(at);
+        }
+    }
 }
 
-/// Whether the sample exceeds the threshold and its four nearest neighbours.
+/// The higher of two determinants, none of which is ever NaN.
 #[inline(always)]
-fn is_candidate([above, here, below]: &[&[f32]; 3], threshold: f32, column: usize) -> bool {
-    let value = here[column];
-    value > threshold
-        && value > here[column - 1]
-        && value > here[column + 1]
-        && value > above[column]
-        && value > below[column]
+fn higher(a: f32, b: f32) -> f32 {
+    if a > b { a } else { b }
 }
 
 /// Whether the sample exceeds its 26 neighbours.

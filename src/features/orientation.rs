@@ -4,6 +4,11 @@
 //! weighted by a Gaussian of 2.5 s. Of all sectors of 60° of gradient directions, one every 5°, the
 //! one with the longest sum of gradients gives the direction (Bay et al., section 4.1).
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::integral::IntegralImage;
 use super::simd::{round_i32, widened};
 
@@ -95,17 +100,22 @@ impl Compass {
         }
         let last = [integral.width() - side, integral.height() - side].map(|n| n as i32);
         let to_corner = (side as f32 - 1.0) * 0.5;
+        let mut corners = [[0_i32; POINTS]; 2];
+        for n in 0..POINTS {
+            let (dx, dy, _) = self.points[n];
+            corners[0][n] = round_i32(x_px + dx * scale_px - to_corner);
+            corners[1][n] = round_i32(y_px + dy * scale_px - to_corner);
+        }
         let mut gradients = Gradients::default();
         let mut len = 0;
-        for &(dx, dy, weight) in &self.points {
-            let x = round_i32(x_px + dx * scale_px - to_corner);
-            let y = round_i32(y_px + dy * scale_px - to_corner);
+        for n in 0..POINTS {
+            let [x, y] = [corners[0][n], corners[1][n]];
             if x < 0 || y < 0 || x >= last[0] || y >= last[1] {
                 continue;
             }
             let (gx, gy) = gradient(integral, x as usize, y as usize, half);
-            gradients.x[len] = gx as f32 * weight;
-            gradients.y[len] = gy as f32 * weight;
+            gradients.x[len] = gx as f32 * self.points[n].2;
+            gradients.y[len] = gy as f32 * self.points[n].2;
             len += 1;
         }
         (len > 0).then(|| {
@@ -133,22 +143,18 @@ impl Default for Gradients {
 
 /// Sum of the right less that of the left half of a square of side `2 half` with upper left corner
 /// `(x, y)`, and the same of its lower and upper half.
+#[inline(always)]
 fn gradient(integral: &IntegralImage, x: usize, y: usize, half: usize) -> (i32, i32) {
-    let corners = |y| {
-        let row = &integral.row(y)[x..][..2 * half + 1];
-        (row[0], row[half], row[2 * half])
+    let [top, middle, bottom] = integral.quarters(x, y, half);
+    let sum = |above: [i32; 3], below: [i32; 3], end: usize| {
+        (below[end].wrapping_sub(below[0])).wrapping_sub(above[end].wrapping_sub(above[0]))
     };
-    let (top, middle, bottom) = (corners(y), corners(y + half), corners(y + 2 * half));
-    let row_sum = |a: (i32, i32, i32), b: (i32, i32, i32)| {
-        b.2.wrapping_sub(b.0).wrapping_sub(a.2.wrapping_sub(a.0))
-    };
-    let left = bottom
-        .1
-        .wrapping_sub(bottom.0)
-        .wrapping_sub(top.1.wrapping_sub(top.0));
-    let all = row_sum(top, bottom);
-    let upper = row_sum(top, middle);
     let twice = |part: i32| part.wrapping_add(part);
+    let (all, left, upper) = (
+        sum(top, bottom, 2),
+        sum(top, bottom, 1),
+        sum(top, middle, 2),
+    );
     (
         all.wrapping_sub(twice(left)),
         all.wrapping_sub(twice(upper)),
@@ -241,8 +247,8 @@ fn angle_rad(x: f32, y: f32) -> f32 {
     let ratio = run.min(rise) / run.max(rise).max(f32::MIN_POSITIVE);
     let square = ratio * ratio;
     let mut sum = 0.0;
-    for n in (0..ODD.len()).rev() {
-        sum = sum * square + ODD[n];
+    for coefficient in ODD.iter().rev() {
+        sum = sum * square + coefficient;
     }
     let first_octant = ratio * sum;
     let quadrant = if rise > run {
@@ -303,7 +309,7 @@ mod tests {
                     *bin = 1.0;
                 }
             }
-            open[degree / 5] = if degree % 5 == 0 { 0.0 } else { 1.0 };
+            open[degree / 5] = if degree.is_multiple_of(5) { 0.0 } else { 1.0 };
             sector_sums(&wrapped, &open)[sector]
         };
         for degree in 0..360 {

@@ -3,6 +3,11 @@
 //! A cell is the mean of 2 × 2 interpolated samples of the pyramid's level that leaves it at most
 //! [`CELL_MAX_PX`] wide: a keypoint of any size costs the same.
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::Keypoint;
 use super::orientation::Direction;
 use super::pyramid::Pyramid;
@@ -73,14 +78,13 @@ impl Patch {
             cell_px *= 0.5;
             level += 1;
         }
-        let reach_px = (0.5 * cells * cell_px * std::f32::consts::SQRT_2).ceil() as i32 + 1;
-        let (left, top) = (
-            x_px.floor() as i32 - reach_px,
-            y_px.floor() as i32 - reach_px,
-        );
+        let extent = direction.cos.abs() + direction.sin.abs();
+        let reach_px = (0.5 * cells * cell_px * extent).ceil() as i32 + 1;
+        let left = x_px.floor() as i32 - reach_px;
+        let top = y_px.floor() as i32 - reach_px;
         let side = 2 * reach_px as usize + 2;
         let image = self.pyramid.level(image, level);
-        copy_window(image, left, top, side, &mut self.window);
+        copy_window(image, [left, top], side, &mut self.window);
         let centre_px = [x_px - left as f32, y_px - top as f32];
         let spacing_px = cell_px / SAMPLES_PER_CELL as f32;
         sample(
@@ -101,42 +105,49 @@ impl Patch {
 }
 
 widened! {
-    /// Copies the square of `side` px with upper left corner `(left, top)` to `window`; what lies
-    /// outside the image is as the nearest pixel inside.
+    /// Copies the square of `side` px, or somewhat more, with the given upper left corner to
+    /// `window`; what lies outside the image is as the nearest pixel inside.
     fn copy_window = copy_window_narrow, (
         image: &GrayImage,
-        left: i32,
-        top: i32,
+        corner: [i32; 2],
         side: usize,
         window: &mut Window,
     )
 }
 
 #[inline(always)]
-fn copy_window_narrow(image: &GrayImage, left: i32, top: i32, side: usize, window: &mut Window) {
+fn copy_window_narrow(image: &GrayImage, corner: [i32; 2], side: usize, window: &mut Window) {
+    let [left, top] = corner;
     let (last_x, last_y) = (image.width() as i32 - 1, image.height() as i32 - 1);
-    let is_inside = left >= 0 && left + side as i32 - 1 <= last_x;
+    // Whole registers, as far as the image goes.
+    let columns = side.next_multiple_of(16);
+    let is_inside = left >= 0 && left + columns as i32 - 1 <= last_x;
     let rows = window.chunks_exact_mut(PITCH).take(side);
     for (y, to) in (top..).zip(rows) {
         let row = image.row(y.clamp(0, last_y) as u32);
         let below = image.row((y + 1).clamp(0, last_y) as u32);
-        let to = &mut to[..side];
-        let pair = |pixel: u8, below: u8| u16::from(pixel) | u16::from(below) << 8;
         if is_inside {
-            let (row, below) = (
-                &row[left as usize..][..side],
-                &below[left as usize..][..side],
-            );
-            for x in 0..side {
-                to[x] = pair(row[x], below[x]);
+            let row = row[left as usize..][..columns].as_chunks::<16>().0;
+            let below = below[left as usize..][..columns].as_chunks::<16>().0;
+            let to = to[..columns].as_chunks_mut::<16>().0;
+            for ((to, row), below) in to.iter_mut().zip(row).zip(below) {
+                for x in 0..16 {
+                    to[x] = pair(row[x], below[x]);
+                }
             }
         } else {
-            for (x, to) in (left..).zip(to) {
+            for (x, to) in (left..).zip(&mut to[..side]) {
                 let x = x.clamp(0, last_x) as usize;
                 *to = pair(row[x], below[x]);
             }
         }
     }
+}
+
+/// A pixel and the one below it as the window holds them.
+#[inline(always)]
+fn pair(pixel: u8, below: u8) -> u16 {
+    u16::from(pixel) | u16::from(below) << 8
 }
 
 widened! {
@@ -159,16 +170,16 @@ fn sample_narrow(
     cells: &mut Cells,
 ) {
     let Direction { cos, sin, .. } = direction;
-    // Sample (a, b) lies at across[b] + down[a].
+    // Sample (a, b) lies at across[·][b] + (down_x[a], down_y[a]).
     let across = [line(0.0, spacing_px * cos), line(0.0, spacing_px * sin)];
-    let down = [
-        line(centre_px[0], -spacing_px * sin),
-        line(centre_px[1], spacing_px * cos),
-    ];
-    for (cell_row, cells) in cells.iter_mut().enumerate() {
+    let down_x = line(centre_px[0], -spacing_px * sin);
+    let down_y = line(centre_px[1], spacing_px * cos);
+    let starts_x = down_x.as_chunks::<SAMPLES_PER_CELL>().0;
+    let starts_y = down_y.as_chunks::<SAMPLES_PER_CELL>().0;
+    for ((cells, x0), y0) in cells.iter_mut().zip(starts_x).zip(starts_y) {
         let mut sums = [0.0; SAMPLES_PADDED];
-        for a in cell_row * SAMPLES_PER_CELL..(cell_row + 1) * SAMPLES_PER_CELL {
-            add_row(window, &across, [down[0][a], down[1][a]], &mut sums);
+        for (&x0, &y0) in x0.iter().zip(y0) {
+            add_row(window, &across, [x0, y0], &mut sums);
         }
         for (cell, samples) in cells.iter_mut().zip(sums.as_chunks::<SAMPLES_PER_CELL>().0) {
             *cell = samples[0] + samples[1];
@@ -275,7 +286,7 @@ mod tests {
     fn outside_the_image_is_its_border() {
         let image = GrayImage::from_vec(2, 2, vec![10, 20, 30, 40]).unwrap_or_default();
         let mut window = [0; LAST + 2];
-        copy_window(&image, -1, -1, 4, &mut window);
+        copy_window(&image, [-1, -1], 4, &mut window);
         let rows: Vec<u16> = window
             .chunks(PITCH)
             .take(4)

@@ -6,6 +6,7 @@
 //! | [`mounting`] | odometry of the camera as odometry of the robot's base |
 //! | `publisher`, `subscriber` (feature `ipc`) | those layouts to and from iceoryx2 services |
 //! | [`row`], [`csv`], [`json`] | one odometry estimate as a row or an object, number for number the same text |
+//! | [`report`] | one HTML page about a run |
 //! | [`tum`] | the trajectory for other tools |
 
 pub mod csv;
@@ -19,6 +20,7 @@ pub mod number;
 pub mod publication;
 #[cfg(feature = "ipc")]
 pub mod publisher;
+pub mod report;
 pub mod row;
 #[cfg(feature = "ipc")]
 pub mod subscriber;

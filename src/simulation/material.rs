@@ -7,7 +7,7 @@
 
 use super::pattern::{Leaves, bricks, leaves};
 use super::texture::{Footprint, Texture};
-use rayon::prelude::*;
+use std::sync::OnceLock;
 
 /// One texture of a material and how it is laid out.
 #[derive(Clone, Debug, PartialEq)]
@@ -29,7 +29,7 @@ pub(super) struct Material {
     pub(super) layers: Vec<Layer>,
 }
 
-/// The textures that scenes are made of; each is painted once a scene.
+/// The textures that scenes are made of.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum TextureKind {
     /// Leaves from a few texels to a few hundred.
@@ -41,11 +41,20 @@ pub(super) enum TextureKind {
 }
 
 impl TextureKind {
-    fn paint(self, seed: u64) -> Texture {
+    /// The texture itself, painted when it is first asked for. It is the same in every scene:
+    /// where its patches lie differs.
+    fn texture(self) -> &'static Texture {
+        static MOSAIC_TEXTURE: OnceLock<Texture> = OnceLock::new();
+        static PATCHES_TEXTURE: OnceLock<Texture> = OnceLock::new();
+        static BRICKS_TEXTURE: OnceLock<Texture> = OnceLock::new();
         match self {
-            Self::Mosaic => Texture::new(2048, &leaves(2048, &MOSAIC, seed)),
-            Self::Patches => Texture::new(1024, &leaves(1024, &PATCHES, seed ^ 0x9a7c)),
-            Self::Bricks => Texture::new(512, &bricks(512, seed ^ 0xb41c)),
+            Self::Mosaic => {
+                MOSAIC_TEXTURE.get_or_init(|| Texture::new(2048, &leaves(2048, &MOSAIC, 1)))
+            }
+            Self::Patches => {
+                PATCHES_TEXTURE.get_or_init(|| Texture::new(1024, &leaves(1024, &PATCHES, 2)))
+            }
+            Self::Bricks => BRICKS_TEXTURE.get_or_init(|| Texture::new(512, &bricks(512, 3))),
         }
     }
 }
@@ -61,51 +70,18 @@ const PATCHES: Leaves = Leaves {
     albedo: [0.1, 0.9],
 };
 
-/// The textures that a scene uses, painted.
-pub(super) struct Textures(Vec<(TextureKind, Texture)>);
-
-impl Textures {
-    /// Paints what `materials` need.
-    pub(super) fn paint(materials: &[Material], seed: u64) -> Self {
-        let mut kinds: Vec<TextureKind> = Vec::new();
-        for layer in materials.iter().flat_map(|m| &m.layers) {
-            if !kinds.contains(&layer.texture) {
-                kinds.push(layer.texture);
-            }
-        }
-        Self(
-            kinds
-                .into_par_iter()
-                .map(|kind| (kind, kind.paint(seed)))
-                .collect(),
-        )
-    }
-
-    fn get(&self, kind: TextureKind) -> Option<&Texture> {
-        self.0.iter().find(|(k, _)| *k == kind).map(|(_, t)| t)
-    }
-}
-
 /// The lattice's spacing in sides of the texture.
 const LATTICE: f64 = 0.3;
 /// Weights start where a lattice point's share exceeds this; most places then read one texture.
-const SHARPEN: f64 = 0.22;
+const SHARPEN: f64 = 0.26;
 
 impl Material {
     /// The albedo around `place` (m on the surface) under an ellipse of covariance `[xx, xy, yy]`
     /// (m²). `seed` tells surfaces of the same material apart.
-    pub(super) fn albedo(
-        &self,
-        textures: &Textures,
-        place: [f64; 2],
-        cov_m2: [f64; 3],
-        seed: u64,
-    ) -> f32 {
+    pub(super) fn albedo(&self, place: [f64; 2], cov_m2: [f64; 3], seed: u64) -> f32 {
         let mut albedo = self.albedo;
         for layer in &self.layers {
-            let Some(texture) = textures.get(layer.texture) else {
-                continue;
-            };
+            let texture = layer.texture.texture();
             let by_texel = 1.0 / layer.texel_m;
             let place = place.map(|p| p * by_texel);
             let footprint = Footprint::new(cov_m2.map(|c| c * by_texel * by_texel));
@@ -172,8 +148,8 @@ pub(super) fn mix(value: u64) -> u64 {
 mod tests {
     use super::*;
 
-    fn mosaic(periodic: bool) -> (Material, Textures) {
-        let material = Material {
+    fn patches(periodic: bool) -> Material {
+        Material {
             albedo: 0.5,
             layers: vec![Layer {
                 texture: TextureKind::Patches,
@@ -181,17 +157,15 @@ mod tests {
                 gain: 1.0,
                 periodic,
             }],
-        };
-        let textures = Textures::paint(std::slice::from_ref(&material), 3);
-        (material, textures)
+        }
     }
 
     /// Albedos along a line, 3 mm apart, from `x` on.
-    fn line(material: &Material, textures: &Textures, x: f64) -> Vec<f32> {
+    fn line(material: &Material, x: f64) -> Vec<f32> {
         (0..400)
             .map(|k| {
                 let place = [x + 0.003 * f64::from(k), 0.4 + 0.001 * f64::from(k)];
-                material.albedo(textures, place, [4e-6, 0.0, 4e-6], 7)
+                material.albedo(place, [4e-6, 0.0, 4e-6], 7)
             })
             .collect()
     }
@@ -208,9 +182,9 @@ mod tests {
     #[test]
     fn a_scattered_texture_does_not_recur_and_a_periodic_one_does() {
         for periodic in [false, true] {
-            let (material, textures) = mosaic(periodic);
-            let here = line(&material, &textures, 0.3);
-            let a_period_on = line(&material, &textures, 0.3 + 1.024);
+            let material = patches(periodic);
+            let here = line(&material, 0.3);
+            let a_period_on = line(&material, 0.3 + 1.024);
             let alike = correlation(&here, &a_period_on);
             if periodic {
                 assert!(alike > 0.999, "{alike}");
@@ -224,11 +198,11 @@ mod tests {
     fn a_scattered_texture_has_no_seams() {
         // Neighbours 0.1 mm apart under an ellipse of 2 mm: no step may exceed the steepest edge
         // that the ellipse allows, contrast · step / (σ √2π) with a contrast of at most 1.
-        let (material, textures) = mosaic(false);
+        let material = patches(false);
         let mut last = None;
         for k in 0..40_000 {
             let place = [1e-4 * f64::from(k), 0.31 * 1e-4 * f64::from(k)];
-            let albedo = material.albedo(&textures, place, [4e-6, 0.0, 4e-6], 7);
+            let albedo = material.albedo(place, [4e-6, 0.0, 4e-6], 7);
             if let Some(before) = last {
                 let step: f32 = albedo - before;
                 assert!(step.abs() < 0.04, "{k}: {step}");

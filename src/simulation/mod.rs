@@ -43,7 +43,7 @@ use crate::settings::SettingError;
 use nalgebra::{Isometry3, Point3, Translation3, Vector2, Vector3};
 use rays::RayMap;
 use render::{ImageKey, Renderer};
-use view::View;
+use view::{SeenFace, View};
 
 /// How a simulation runs.
 #[derive(Clone, Debug, PartialEq, serde::Deserialize, serde::Serialize)]
@@ -262,29 +262,6 @@ impl Simulation {
             .render(&self.scene, &views, &self.settings.sensor, key)
     }
 
-    /// The depth, m along the optical axis, of what pair `frame` shows at `pixel`; `None` for the
-    /// sky and where the lens' model has no inverse.
-    #[must_use]
-    pub fn depth_m(&self, frame: u64, side: Side, pixel: &Vector2<f64>) -> Option<f64> {
-        self.surface_at(frame, side, pixel).map(|(depth, _)| depth)
-    }
-
-    /// Whether pair `frame` shows a moving body at `pixel`.
-    #[must_use]
-    pub fn is_moving(&self, frame: u64, side: Side, pixel: &Vector2<f64>) -> bool {
-        self.surface_at(frame, side, pixel)
-            .is_some_and(|(_, moving)| moving)
-    }
-
-    fn surface_at(&self, frame: u64, side: Side, pixel: &Vector2<f64>) -> Option<(f64, bool)> {
-        let ray = self.camera(side).unproject(pixel)?;
-        let view = self.view(self.time_s(frame), side);
-        let all: Vec<usize> = (0..view.faces.len()).collect();
-        let seen = &view.faces[view.nearest(&all, [ray.x, ray.y])?];
-        let moving = self.scene.faces[seen.face].body.is_some();
-        Some((seen.depth_m([ray.x, ray.y]), moving))
-    }
-
     fn camera(&self, side: Side) -> &Camera {
         match side {
             Side::Left => &self.rig.left,
@@ -357,6 +334,49 @@ impl Simulation {
                     .is_free(&Point3::from(world_from_camera.translation.vector))
             })
         })
+    }
+}
+
+/// Looks through one camera at one instant: what is true at a pixel.
+pub struct Looker<'a> {
+    scene: &'a Scene,
+    camera: &'a Camera,
+    view: View,
+    all: Vec<usize>,
+}
+
+impl<'a> Looker<'a> {
+    /// Through the camera on `side` of `simulation` when pair `frame` is taken.
+    #[must_use]
+    pub fn new(simulation: &'a Simulation, frame: u64, side: Side) -> Self {
+        let view = simulation.view(simulation.time_s(frame), side);
+        Self {
+            scene: &simulation.scene,
+            camera: simulation.camera(side),
+            all: (0..view.faces.len()).collect(),
+            view,
+        }
+    }
+
+    /// The depth, m along the optical axis, of what is seen at `pixel`; `None` for the sky and where
+    /// the lens' model has no inverse.
+    #[must_use]
+    pub fn depth_m(&self, pixel: &Vector2<f64>) -> Option<f64> {
+        let (seen, ray) = self.seen_at(pixel)?;
+        Some(seen.depth_m(ray))
+    }
+
+    /// Whether what is seen at `pixel` moves on its own.
+    #[must_use]
+    pub fn is_moving(&self, pixel: &Vector2<f64>) -> bool {
+        self.seen_at(pixel)
+            .is_some_and(|(seen, _)| self.scene.faces[seen.face].body.is_some())
+    }
+
+    fn seen_at(&self, pixel: &Vector2<f64>) -> Option<(&SeenFace, [f64; 2])> {
+        let ray: [f64; 2] = self.camera.unproject(pixel)?.into();
+        let index = self.view.nearest(&self.all, ray)?;
+        Some((&self.view.faces[index], ray))
     }
 }
 

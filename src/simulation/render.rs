@@ -160,7 +160,7 @@ impl Renderer {
         }
         let face = &scene.faces[seen.face];
         let material = &scene.materials[face.material];
-        face.shade * material.albedo(&scene.textures, footing.place, footing.cov_m2, face.seed)
+        face.shade * material.albedo(footing.place, footing.cov_m2, face.seed)
     }
 
     /// The radiance of a pixel that several surfaces share.

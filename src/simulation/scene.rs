@@ -3,7 +3,7 @@
 //! The world frame has the axes of a camera that stands level at the trajectory's start: x right,
 //! y down, z forward, metres.
 
-use super::material::{Material, Textures, mix};
+use super::material::{Material, mix};
 use nalgebra::{Isometry3, Point3, Vector3};
 
 /// A rectangle that is seen from one side, fixed to a body.
@@ -64,7 +64,6 @@ impl Escort {
 pub struct Scene {
     pub(super) faces: Vec<Face>,
     pub(super) materials: Vec<Material>,
-    pub(super) textures: Textures,
     pub(super) bodies: Vec<Escort>,
     /// Radiance of what no face covers.
     pub(super) sky: f32,
@@ -174,13 +173,11 @@ impl Builder {
         self.sides(&Isometry3::identity(), &half_m, of, Some(body));
     }
 
-    /// The scene, its textures painted.
+    /// The finished scene.
     pub(super) fn build(self) -> Scene {
-        let textures = Textures::paint(&self.materials, self.seed);
         Scene {
             faces: self.faces,
             materials: self.materials,
-            textures,
             bodies: self.bodies,
             sky: self.sky,
             blocks: self.blocks,
@@ -216,17 +213,18 @@ impl Builder {
         of: &Material,
         body: Option<usize>,
     ) {
-        let unit = |i: usize| Vector3::ith(i % 3, 1.0);
+        let unit = |i: usize| Vector3::ith(i, 1.0);
         let towards_viewer = if outside { sign } else { -sign };
-        // unit(a + 1) × unit(a + 2) = unit(a): swapped, the face looks the other way.
-        let (b, c) = if towards_viewer > 0.0 {
-            (axis + 1, axis + 2)
-        } else {
-            (axis + 2, axis + 1)
-        };
-        let (b, c) = (b % 3, c % 3);
+        // unit(a + 1) × unit(a + 2) = unit(a). Textures are read fastest along `across`: it is the
+        // direction in which a face is usually foreshortened, level, and forwards where there is a
+        // choice. `along` completes it to a face that is seen from the right side.
+        let across = if axis == 2 { unit(0) } else { unit(2) };
+        let along = unit(axis).cross(&across) * towards_viewer;
+        let half_of = |v: &Vector3<f64>| v.abs().dot(half_m);
         let corner = Point3::from(
-            unit(axis) * (sign * half_m[axis]) - unit(b) * half_m[b] - unit(c) * half_m[c],
+            unit(axis) * (sign * half_m[axis])
+                - across * half_of(&across)
+                - along * half_of(&along),
         );
         let normal = body_from_block * unit(axis) * towards_viewer;
         let light = Vector3::new(0.45, -0.75, -0.5).normalize();
@@ -234,9 +232,9 @@ impl Builder {
         let material = self.index_of(of);
         self.faces.push(Face {
             corner: body_from_block * corner,
-            across: body_from_block * unit(b),
-            along: body_from_block * unit(c),
-            size_m: [2.0 * half_m[b], 2.0 * half_m[c]],
+            across: body_from_block * across,
+            along: body_from_block * along,
+            size_m: [2.0 * half_of(&across), 2.0 * half_of(&along)],
             material,
             seed: mix(self.seed ^ mix(self.faces.len() as u64)),
             shade: shade as f32,

@@ -118,6 +118,12 @@ fn tiles(albedo: f32, texel_m: f64) -> Material {
     }
 }
 
+/// What tests of textures look at.
+#[cfg(test)]
+pub(super) fn plain_mosaic() -> Material {
+    mosaic(0.5, 0.0015, 0.9)
+}
+
 /// The brightness of a box: bright, middle or dark.
 fn any_albedo(rng: &mut Xoshiro256PlusPlus) -> f32 {
     rng.random_range(0.35..0.65)
@@ -313,8 +319,8 @@ fn mover(seed: u64, rng: &mut Xoshiro256PlusPlus) -> Scene {
         };
         hall.moving_block(size, escort, &mosaic(0.5, 0.001, 0.9));
     };
-    escort([1.2, 1.9, 0.8], -0.75, 5.2, [0.35, 0.0, 0.3], 5.3);
-    escort([0.9, 1.8, 0.9], 0.95, 4.6, [0.25, 0.0, -0.4], 3.7);
+    escort([1.0, 1.6, 0.8], -0.75, 5.2, [0.35, 0.0, 0.3], 5.3);
+    escort([0.75, 1.5, 0.9], 0.95, 4.6, [0.25, 0.0, -0.4], 3.7);
     hall.build()
 }
 
