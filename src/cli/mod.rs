@@ -17,7 +17,12 @@ use std::process::ExitCode;
 
 /// Stereo visual odometry that knows its own error.
 #[derive(Parser)]
-#[command(version, about, arg_required_else_help = true)]
+#[command(
+    version,
+    about,
+    arg_required_else_help = true,
+    after_help = "Example: visod demo"
+)]
 struct Cli {
     #[command(subcommand)]
     command: Command,

@@ -6,6 +6,7 @@ use std::path::PathBuf;
 
 /// Look after calibration files.
 #[derive(clap::Args)]
+#[command(after_help = "Example: visod rig check rig.toml")]
 pub(crate) struct Args {
     #[command(subcommand)]
     command: Command,

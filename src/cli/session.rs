@@ -237,5 +237,5 @@ fn latencies(took: &StageLatencies) -> Latencies {
 
 /// The failure that an output file cannot be written.
 pub(crate) fn unwritable(file: &Path, cause: &io::Error) -> Failure {
-    Failure::other(format!("{} cannot be written: {cause}", file.display()))
+    Failure::other(format!("{}: cannot be written: {cause}", file.display()))
 }

@@ -55,6 +55,9 @@ impl Config {
         let config: Self = text.parse()?;
         for (table, checked) in [
             ("dataset", config.dataset.check()),
+            ("features.surf", config.features.surf.check()),
+            #[cfg(feature = "opencv")]
+            ("features.opencv", config.features.opencv.check()),
             ("features", config.features.check()),
             ("matching", config.matching.check()),
             ("estimation", config.estimation.check()),
@@ -94,6 +97,10 @@ mod tests {
         assert_eq!(
             error_of("[matching]\n\nmax_ratio = 7.0\n"),
             "configuration:3: matching.max_ratio: must be from 0.1 to 1, but is 7"
+        );
+        assert_eq!(
+            error_of("[features]\n[features.surf]\nhessian = -1.0\n"),
+            "configuration:3: features.surf.hessian: must be from 0 to 1000000, but is -1"
         );
         let nan = error_of("[estimation]\ngate_sigma2 = nan\n");
         assert!(
