@@ -220,13 +220,10 @@ impl Session {
 }
 
 /// The stages' latencies as the message has them.
-#[cfg_attr(
-    not(feature = "ipc"),
-    expect(dead_code, reason = "only messages carry them")
-)]
-fn latencies(took: &StageLatencies) -> Latencies {
+#[cfg(feature = "ipc")]
+fn latencies(took: &crate::pipeline::StageLatencies) -> crate::output::message::Latencies {
     let ns = |d: std::time::Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
-    Latencies {
+    crate::output::message::Latencies {
         capture_ns: 0,
         features_ns: ns(took.features),
         matching_ns: ns(took.matching),
