@@ -16,3 +16,5 @@ mod publication;
 mod python_client;
 #[cfg(test)]
 mod recordings;
+#[cfg(test)]
+mod report;
