@@ -19,3 +19,5 @@ mod publication;
 mod python_client;
 #[cfg(test)]
 mod recordings;
+#[cfg(test)]
+mod report;
