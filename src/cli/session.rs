@@ -221,7 +221,7 @@ impl Session {
 
 /// The stages' latencies as the message has them.
 #[cfg(feature = "ipc")]
-fn latencies(took: &crate::pipeline::StageLatencies) -> crate::output::message::Latencies {
+fn latencies(took: &pipeline::StageLatencies) -> crate::output::message::Latencies {
     let ns = |d: std::time::Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
     crate::output::message::Latencies {
         capture_ns: 0,
