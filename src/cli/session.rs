@@ -15,7 +15,7 @@ use indicatif::ProgressBar;
 use std::fs::File;
 use std::io;
 use std::ops::ControlFlow;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Sees each row as it comes.
 type RowWatcher = Box<dyn FnMut(&OdometryRow)>;
@@ -24,8 +24,8 @@ type RowWatcher = Box<dyn FnMut(&OdometryRow)>;
 pub(crate) struct Session {
     config: Config,
     rig: StereoRig,
-    csv: Option<OdometryCsvWriter<File>>,
-    trajectory: Option<TumWriter<File>>,
+    csv: Option<(PathBuf, OdometryCsvWriter<File>)>,
+    trajectory: Option<(PathBuf, TumWriter<File>)>,
     rows: Option<Vec<OdometryRow>>,
     #[cfg(feature = "ipc")]
     publisher: Option<Publisher>,
@@ -80,7 +80,8 @@ impl Session {
     /// Writes the odometry CSV.
     pub(crate) fn write_csv(&mut self, file: Option<&Path>) -> Result<(), Failure> {
         if let Some(file) = file {
-            self.csv = Some(OdometryCsvWriter::create(file).map_err(|e| unwritable(file, &e))?);
+            let csv = OdometryCsvWriter::create(file).map_err(|e| unwritable(file, &e))?;
+            self.csv = Some((file.to_owned(), csv));
         }
         Ok(())
     }
@@ -88,7 +89,8 @@ impl Session {
     /// Writes the trajectory in TUM format.
     pub(crate) fn write_trajectory(&mut self, file: Option<&Path>) -> Result<(), Failure> {
         if let Some(file) = file {
-            self.trajectory = Some(TumWriter::create(file).map_err(|e| unwritable(file, &e))?);
+            let trajectory = TumWriter::create(file).map_err(|e| unwritable(file, &e))?;
+            self.trajectory = Some((file.to_owned(), trajectory));
         }
         Ok(())
     }
@@ -149,11 +151,11 @@ impl Session {
         })
         .map_err(Failure::other)?;
         bar.finish_and_clear();
-        if let Some(csv) = self.csv {
-            csv.finish().map_err(Failure::other)?;
+        if let Some((file, csv)) = self.csv {
+            csv.finish().map_err(|e| unwritable(&file, &e))?;
         }
-        if let Some(trajectory) = self.trajectory {
-            trajectory.finish().map_err(Failure::other)?;
+        if let Some((file, trajectory)) = self.trajectory {
+            trajectory.finish().map_err(|e| unwritable(&file, &e))?;
         }
         #[cfg(feature = "ipc")]
         if let Some(publisher) = self.publisher {
@@ -174,12 +176,15 @@ impl Session {
         // Latency belongs to the run, not to the recording: two replays write the same bytes.
         let row = OdometryRow::new(delivery.odometry, None);
         self.send(delivery);
-        if let Some(csv) = &mut self.csv {
-            csv.write_row(&row)?;
-            csv.flush()?;
+        if let Some((file, csv)) = &mut self.csv {
+            csv.write_row(&row)
+                .and_then(|()| csv.flush())
+                .map_err(|e| named(file, &e))?;
         }
-        if let Some(trajectory) = &mut self.trajectory {
-            trajectory.write(row.timestamp_ns, &delivery.odometry.odom_from_camera)?;
+        if let Some((file, trajectory)) = &mut self.trajectory {
+            trajectory
+                .write(row.timestamp_ns, &delivery.odometry.odom_from_camera)
+                .map_err(|e| named(file, &e))?;
         }
         if let Some(see) = &mut self.each_row {
             bar.suspend(|| see(&row));
@@ -234,5 +239,10 @@ fn latencies(took: &pipeline::StageLatencies) -> crate::output::message::Latenci
 
 /// The failure that an output file cannot be written.
 pub(crate) fn unwritable(file: &Path, cause: &io::Error) -> Failure {
-    Failure::other(format!("{}: cannot be written: {cause}", file.display()))
+    Failure::other(named(file, cause))
+}
+
+/// The system's error with the file's name before it.
+fn named(file: &Path, cause: &io::Error) -> io::Error {
+    io::Error::other(format!("{}: cannot be written: {cause}", file.display()))
 }

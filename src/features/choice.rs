@@ -50,7 +50,12 @@ impl Settings {
         self.opencv.check()?;
         #[cfg(not(feature = "opencv"))]
         if self.opencv.is_some() || self.detector != DetectorName::Surf {
-            return Err(not_built_in());
+            let key = if self.opencv.is_some() {
+                "opencv"
+            } else {
+                "detector"
+            };
+            return Err(not_built_in(key));
         }
         Ok(())
     }
@@ -89,13 +94,13 @@ fn opencv_extractor(
 
 #[cfg(not(feature = "opencv"))]
 fn opencv_extractor(_: DetectorName, _: &Settings) -> Result<Box<dyn Extractor>, SettingError> {
-    Err(not_built_in())
+    Err(not_built_in("detector"))
 }
 
 #[cfg(not(feature = "opencv"))]
-fn not_built_in() -> SettingError {
+fn not_built_in(key: &'static str) -> SettingError {
     SettingError {
-        key: "detector",
+        key,
         cause: "OpenCV's detectors need the cargo feature `opencv`, with which this visod was not built"
             .to_owned(),
     }

@@ -3,11 +3,15 @@
 //! A line of `cfg(test)` of its own on each lets clippy know that helpers may unwrap too.
 
 #[cfg(test)]
+mod accuracy;
+#[cfg(test)]
 mod evaluate;
 #[cfg(test)]
 mod features;
 #[cfg(test)]
 mod frame_source;
+#[cfg(test)]
+mod mistakes;
 #[cfg(test)]
 #[cfg(feature = "opencv")]
 mod opencv;
@@ -19,5 +23,11 @@ mod publication;
 mod python_client;
 #[cfg(test)]
 mod recordings;
+mod replay;
+#[cfg(test)]
+#[cfg(feature = "ipc")]
+mod replay_publication;
 #[cfg(test)]
 mod report;
+#[cfg(test)]
+mod samples;

@@ -15,7 +15,7 @@ use visod::output::row::OdometryRow;
 use visod::output::subscriber::{HealthSubscriber, OdometrySubscriber, Wake};
 
 /// Longer than anything here takes, even on a busy machine.
-const PATIENCE: Duration = Duration::from_secs(60);
+pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
 
 /// An iceoryx2 of its own: nothing outside this test meets what is published in it.
 pub(crate) struct System {
@@ -47,7 +47,7 @@ impl System {
         self.settings.prefix.clone().unwrap()
     }
 
-    fn listen(&self, args: &[&str]) -> Child {
+    pub(crate) fn listen(&self, args: &[&str]) -> Child {
         Command::new(env!("CARGO_BIN_EXE_visod"))
             .arg("listen")
             .args(["--service-root", &self.root()])

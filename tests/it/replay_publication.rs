@@ -1,0 +1,116 @@
+//! `visod replay` publishes what `visod listen`, a second process, receives.
+
+use super::accuracy::test_recording;
+use super::publication::{PATIENCE, System};
+use super::replay::{PAIRS, Recording, Replayed, replay, stderr_of};
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use serde_json::Value;
+use std::path::Path;
+use visod::geometry::{load_rig, rig_to_toml};
+use visod::output::publisher::Publisher;
+
+/// Replays a recording in an iceoryx2 of its own, to a listener that was there first.
+fn heard(recording: &Path, pairs: u64) -> (Replayed, Vec<String>) {
+    let system = System::new();
+    let folder = tempfile::tempdir().unwrap();
+    let config = folder.path().join("visod.toml");
+    let publish = format!(
+        "[publish]\nroot = \"{}\"\nprefix = \"{}\"\n",
+        system.root(),
+        system.prefix()
+    );
+    std::fs::write(&config, publish).unwrap();
+    let listener = system.listen(&["--json", "--count", &pairs.to_string(), "--timeout", "60"]);
+    // Another publisher, which leaves before the replay comes, tells when the listener is there.
+    let publisher = Publisher::new(&system.settings).unwrap();
+    assert!(publisher.wait_for_subscribers(1, PATIENCE));
+    publisher.close();
+    let run = replay(recording, &["--config", config.to_str().unwrap()]);
+    assert_eq!(stderr_of(&run.output), "");
+    assert_eq!(run.summary["published"].as_u64(), Some(pairs));
+    assert_eq!(run.summary["publish_failures"].as_u64(), Some(0));
+    let output = listener.wait_with_output().unwrap();
+    assert!(output.status.success(), "{}", stderr_of(&output));
+    let text = String::from_utf8(output.stdout).unwrap();
+    (run, text.lines().map(str::to_owned).collect())
+}
+
+/// Every column of the CSV stands in the message with the same text.
+fn assert_same_text(run: &Replayed, messages: &[String]) {
+    let mut lines = run.csv.lines();
+    let header: Vec<&str> = lines.next().unwrap().split(',').collect();
+    assert_eq!(messages.len(), run.rows.len());
+    for (line, message) in lines.zip(messages) {
+        for (name, text) in header.iter().zip(line.split(',')) {
+            let expected = match (*name, text) {
+                (_, "nan") => format!("\"{name}\":null"),
+                ("status", word) => format!("\"{name}\":\"{word}\""),
+                (_, number) => format!("\"{name}\":{number}"),
+            };
+            let at = message.find(&expected);
+            let end = at.and_then(|at| message[at + expected.len()..].chars().next());
+            assert!(
+                matches!(end, Some(',' | '}')),
+                "{expected} is not in {message}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_listener_hears_every_row_of_a_replay_digit_by_digit() {
+    let recording = Recording::shared();
+    let (run, messages) = heard(recording.path(), PAIRS);
+    assert_same_text(&run, &messages);
+    for message in &messages {
+        let message: Value = serde_json::from_str(message).unwrap();
+        assert_eq!(message["replay"], true);
+        assert_eq!(message["frame"], "left_camera");
+        for stage in ["features", "matching", "estimation", "total"] {
+            let first = message["seq"] == 0 && stage == "estimation";
+            assert!(
+                first || message["latencies_ns"][stage].as_u64() > Some(0),
+                "{stage}: {message}"
+            );
+        }
+    }
+}
+
+#[test]
+fn a_listener_hears_every_row_of_a_drive_of_kitti_digit_by_digit() {
+    let Some(recording) = test_recording("kitti_straight") else {
+        return;
+    };
+    let (run, messages) = heard(&recording, 51);
+    assert_same_text(&run, &messages);
+}
+
+#[test]
+fn with_a_mounting_the_pose_of_the_base_is_published() {
+    let recording = Recording::shared();
+    let copy = recording.copy();
+    let mut rig = load_rig(&copy.path().join("rig.toml")).unwrap();
+    let base_from_camera = Isometry3::from_parts(
+        Translation3::new(0.4, 0.1, 0.8),
+        UnitQuaternion::from_euler_angles(-1.6, 0.1, -1.5),
+    );
+    rig.base_from_camera = Some(base_from_camera);
+    std::fs::write(copy.path().join("rig.toml"), rig_to_toml(&rig)).unwrap();
+    let (run, messages) = heard(copy.path(), PAIRS);
+    for (row, message) in run.rows.iter().zip(&messages) {
+        let message: Value = serde_json::from_str(message).unwrap();
+        assert_eq!(message["frame"], "base");
+        let number = |name: &str| message[name].as_f64().unwrap();
+        let [x, y, z, i, j, k, w] = ["tx", "ty", "tz", "qx", "qy", "qz", "qw"].map(number);
+        let published = Isometry3::from_parts(
+            Translation3::new(x, y, z),
+            UnitQuaternion::new_normalize(Quaternion::new(w, i, j, k)),
+        );
+        let expected = base_from_camera * row.odom_from_camera * base_from_camera.inverse();
+        let off = published.inverse() * expected;
+        assert!(off.translation.vector.norm() < 1e-9 && off.rotation.angle() < 1e-9);
+    }
+    // The file keeps the camera's pose.
+    let plain = super::replay::replay_quietly(recording.path(), &[]);
+    assert!(run.csv == plain.csv);
+}
