@@ -30,4 +30,5 @@ mod replay_publication;
 #[cfg(test)]
 mod report;
 #[cfg(test)]
+#[cfg(test)]
 mod samples;
