@@ -1,6 +1,7 @@
 //! `visod features`: an image in, its SURF keypoints and descriptors as CSV out.
 
 use super::Failure;
+use crate::capture::decode::Decoder;
 use crate::features::surf::{Settings, Surf};
 use crate::features::{Extractor, Features};
 use crate::image::GrayImage;
@@ -15,7 +16,7 @@ use std::path::{Path, PathBuf};
 #[derive(clap::Args)]
 #[command(after_help = "Example: visod features left.png -o features.csv --hessian 200")]
 pub(crate) struct Args {
-    /// The image: PNG, JPEG or PGM, grey or colour.
+    /// The image: PNG, JPEG, PGM or PPM, grey or colour.
     image: PathBuf,
     /// The CSV file to write; `-` for standard output.
     #[arg(short, long, default_value = "-", value_name = "F.csv")]
@@ -54,36 +55,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let mut surf =
         Surf::new(settings).map_err(|e| Failure::usage(format!("--{} {}", e.key, e.cause)))?;
-    let image = load(&args.image)?;
+    let mut image = GrayImage::default();
+    Decoder::new(u16::MAX)
+        .decode(&args.image, None, &mut image)
+        .map_err(Failure::other)?;
     let mut features = Features::default();
     surf.extract(&image, &mut features)
         .map_err(Failure::other)?;
     write(&features, &args.output)
-}
-
-/// Reads an image as grey values, colours weighted as by OpenCV.
-fn load(path: &Path) -> Result<GrayImage, Failure> {
-    let fail = |cause: String| Failure::other(format!("{}: {cause}", path.display()));
-    let decoded = image::ImageReader::open(path)
-        .and_then(image::ImageReader::with_guessed_format)
-        .map_err(|e| fail(format!("cannot be read: {e}")))?
-        .decode()
-        .map_err(|e| fail(format!("is no image that can be decoded: {e}")))?;
-    let (width, height) = (decoded.width(), decoded.height());
-    if width == 0 || height == 0 {
-        return Err(fail(format!("has no pixels: {width} × {height}")));
-    }
-    let pixels = if decoded.color().has_color() {
-        let weigh = |[r, g, b]: [u8; 3]| {
-            let thousandths = 299 * u32::from(r) + 587 * u32::from(g) + 114 * u32::from(b);
-            ((thousandths + 500) / 1000) as u8
-        };
-        decoded.into_rgb8().pixels().map(|p| weigh(p.0)).collect()
-    } else {
-        decoded.into_luma8().into_raw()
-    };
-    GrayImage::from_vec(width, height, pixels)
-        .ok_or_else(|| fail("has another number of pixels than its header says".to_owned()))
 }
 
 fn write(features: &Features, path: &Path) -> Result<(), Failure> {

@@ -6,17 +6,19 @@ use crate::config::Config;
 use crate::features;
 use crate::geometry::{Severity, StereoRig, check_rig};
 use crate::output::csv::OdometryCsvWriter;
-use crate::output::message::{CaptureTime, Latencies, OdometryMessage};
 #[cfg(feature = "ipc")]
 use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
-use crate::pipeline::{self, Delivery, Method, RunFigures, StageLatencies, Statistics};
+use crate::pipeline::{self, Delivery, Method, RunFigures, Statistics};
 use indicatif::ProgressBar;
 use std::fs::File;
 use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+
+/// Sees each row as it comes.
+type RowWatcher = Box<dyn FnMut(&OdometryRow)>;
 
 /// Where the rows of a run go.
 pub(crate) struct Session {
@@ -29,7 +31,7 @@ pub(crate) struct Session {
     publisher: Option<Publisher>,
     published: u64,
     publish_failures: u64,
-    each_row: Option<Box<dyn FnMut(&OdometryRow)>>,
+    each_row: Option<RowWatcher>,
 }
 
 /// What a run came to.
@@ -195,6 +197,8 @@ impl Session {
 
     #[cfg(feature = "ipc")]
     fn send(&mut self, delivery: &Delivery<'_>) {
+        use crate::output::message::{CaptureTime, OdometryMessage};
+
         let Some(publisher) = &mut self.publisher else {
             return;
         };
@@ -221,13 +225,10 @@ impl Session {
 }
 
 /// The stages' latencies as the message has them.
-#[cfg_attr(
-    not(feature = "ipc"),
-    expect(dead_code, reason = "only messages carry them")
-)]
-fn latencies(took: &StageLatencies) -> Latencies {
+#[cfg(feature = "ipc")]
+fn latencies(took: &pipeline::StageLatencies) -> crate::output::message::Latencies {
     let ns = |d: std::time::Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
-    Latencies {
+    crate::output::message::Latencies {
         capture_ns: 0,
         features_ns: ns(took.features),
         matching_ns: ns(took.matching),

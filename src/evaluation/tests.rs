@@ -506,3 +506,37 @@ fn a_camera_beside_the_body_is_taken_into_account() {
     assert!(found.rpe.unwrap().translation_m.max < 1e-12);
     assert!(found.ate[0].rotation_deg.max < 1e-6);
 }
+
+#[test]
+fn the_place_of_a_camera_is_read_from_its_sensor_file() {
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("sensor.yaml");
+    let read = |list: &str| {
+        let text = format!("%YAML:1.0\nT_BS:\n  cols: 4\n  rows: 4\n  data: {list}\nrate_hz: 20\n");
+        std::fs::write(&path, text).unwrap();
+        read_body_from_camera(&path).map_err(|e| e.to_string())
+    };
+    let pose =
+        read("[0.0, -1.0, 0.0, 0.1,\n 1.0, 0.0, 0.0, 0.2,\n 0.0, 0.0, 1.0, 0.3,\n 0, 0, 0, 1]");
+    let pose = pose.unwrap();
+    assert_eq!(pose.translation.vector, Vector3::new(0.1, 0.2, 0.3));
+    assert!((pose * Vector3::x() - Vector3::y()).norm() < 1e-12);
+    for (list, said) in [
+        ("[1, 2, 3]", "T_BS must have 16 numbers"),
+        (
+            "[1, 0, 0, 0, 0, 1, 0, 0, 0, 0, x, 0, 0, 0, 0, 1]",
+            "not a number",
+        ),
+        (
+            "[2, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]",
+            "not a rotation",
+        ),
+        ("none", "no data"),
+    ] {
+        let error = read(list).unwrap_err();
+        assert!(
+            error.contains("sensor.yaml:2: ") && error.contains(said),
+            "{error}"
+        );
+    }
+}

@@ -26,8 +26,8 @@ const DROPPED: f32 = 0.0;
 pub struct Settings {
     /// Determinant of the Hessian that a keypoint exceeds, grey values² / px⁴ as OpenCV scales it;
     /// 0 to 1e6, default 100. Low, so that images of little contrast have features too: the
-    /// budget keeps the strongest. Between 50 and 100 three quarters of the keypoints were found
-    /// again under noise, above 1600 nineteen of twenty.
+    /// budget keeps the strongest. Of keypoints between 50 and 100, 59 to 77 % were found again
+    /// under noise on five images; above 1600, 81 to 95 %.
     pub hessian: f32,
     /// Octaves, each with half the samples of the one before; 1 to 8, default 4.
     pub octaves: u32,

@@ -107,9 +107,10 @@ impl Method {
         self.match_left_and_right();
         self.triangulate();
         let Some(mut odometer) = self.odometer.take() else {
+            let matched = Instant::now();
             let mut odometer = Odometer::new(self.estimation.clone(), stamp);
             let row = odometer.begin(stamp, self.counts(None));
-            self.finish(odometer, true, started, started);
+            self.finish(odometer, true, started, matched);
             return row;
         };
         let predicted = odometer.predict(stamp.timestamp_ns);

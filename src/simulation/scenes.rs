@@ -41,7 +41,7 @@ impl SceneName {
     /// The scene itself; `seed` decides its textures and where its boxes stand.
     #[must_use]
     pub fn build(self, seed: u64) -> Scene {
-        let rng = &mut Xoshiro256PlusPlus::seed_from_u64(mix(seed ^ 0x5ce_e5));
+        let rng = &mut Xoshiro256PlusPlus::seed_from_u64(mix(seed ^ 0x5cee5));
         match self {
             Self::Room => furnished_room(
                 seed,

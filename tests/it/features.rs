@@ -1,7 +1,5 @@
 //! SURF against OpenCV's, its invariances, its limits, and `visod features`.
 
-#![expect(clippy::unwrap_used, reason = "a test that cannot go on has failed")]
-
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::path::{Path, PathBuf};

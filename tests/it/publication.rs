@@ -1,10 +1,5 @@
 //! Publisher and `visod listen` as two processes.
 
-#![expect(
-    clippy::unwrap_used,
-    reason = "a helper of a test fails as the test does"
-)]
-
 use nalgebra::{Isometry3, Matrix6, Vector3, Vector6};
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Output, Stdio};

@@ -1,12 +1,7 @@
 //! The Python client in `tools/clients/` against the publisher.
 //!
-//! Needs a Python with `tools/clients/requirements.txt`: that of `VISOD_TEST_PYTHON`, else `python3`.
+//! Needs a Python with `tools/clients/requirements.txt`: that of `VISOD_PYTHON`, else `python3`.
 //! Without one these tests say so and do nothing.
-
-#![expect(
-    clippy::unwrap_used,
-    reason = "a helper of a test fails as the test does"
-)]
 
 use crate::publication::{System, message, odometry};
 use serde_json::Value;
@@ -21,7 +16,7 @@ fn clients() -> PathBuf {
 
 /// A Python that can run the client, or none.
 fn python() -> Option<Command> {
-    let name = std::env::var("VISOD_TEST_PYTHON").unwrap_or_else(|_| "python3".to_owned());
+    let name = std::env::var("VISOD_PYTHON").unwrap_or_else(|_| "python3".to_owned());
     let able = Command::new(&name)
         .args(["-c", "import iceoryx2"])
         .stderr(Stdio::null())

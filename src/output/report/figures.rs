@@ -218,8 +218,8 @@ fn sigmas(run: &Run) -> Figure {
     Figure {
         title: "Published uncertainty of the pose, 1 σ".to_owned(),
         sentence:
-            "What the odometry says of its own error, axis by axis; without a map to return to \
-                   it can only grow."
+            "What the odometry says of its own error, axis by axis. It accumulates; a position's \
+                   σ falls only where the way turns back and an error of heading weighs less again."
                 .to_owned(),
         legend: [("x", "right"), ("y", "down"), ("z", "forward")]
             .iter()

@@ -36,14 +36,14 @@ pub(super) fn from_above(run: &Run) -> Figure {
         let places = rows.iter().map(|row| layout.place(&row.odom_from_camera));
         places.collect()
     };
-    for (status, first, end) in run.stretches(|row| row.status) {
-        let part = path(&run.rows[first.saturating_sub(1)..end]);
-        match status {
-            Status::Degraded => panel.line(&part, "doubtful"),
-            Status::Lost => panel.line(&part, "missing"),
-            Status::Initializing | Status::Tracking => {}
+    let of_status = |wanted: Status, panel: &mut Panel, class: &str| {
+        for (status, first, end) in run.stretches(|row| row.status) {
+            if status == wanted {
+                panel.line(&path(&run.rows[first.saturating_sub(1)..end]), class);
+            }
         }
-    }
+    };
+    of_status(Status::Degraded, &mut panel, "doubtful");
     if let Some(truth) = &run.truth {
         let gap = (f64::NAN, f64::NAN);
         let places = truth.iter().map(|p| p.map_or(gap, |p| layout.place(&p)));
@@ -52,6 +52,7 @@ pub(super) fn from_above(run: &Run) -> Figure {
     for (_, first, end) in run.stretches(|row| row.epoch) {
         panel.line(&path(&run.rows[first..end]), "tracked");
     }
+    of_status(Status::Lost, &mut panel, "missing");
     panel.draw(&layout.ellipses(run));
     panel.draw(&layout.ends(run));
     panel.draw(&layout.scale_bar());

@@ -73,14 +73,22 @@ impl Scale {
     fn decades(&self) -> Vec<(f64, String)> {
         let (low, high) = self.domain;
         let (first, last) = (low.log10().ceil() as i32, high.log10().floor() as i32);
-        (first..=last)
-            .map(|exponent| {
+        let digits: &[u32] = if high / low < 2000.0 {
+            &[1, 2, 5]
+        } else {
+            &[1]
+        };
+        (first - 1..=last)
+            .flat_map(|exponent| digits.iter().map(move |digit| (exponent, *digit)))
+            .map(|(exponent, digit)| {
+                let value = f64::from(digit) * 10_f64.powi(exponent);
                 let label = match exponent {
-                    -3..=4 => number(10_f64.powi(exponent), (-exponent).max(0) as usize),
-                    _ => format!("1e{exponent}").replace('-', "−"),
+                    -3..=4 => number(value, (-exponent).max(0) as usize),
+                    _ => format!("{digit}e{exponent}").replace('-', "−"),
                 };
-                (10_f64.powi(exponent), label)
+                (value, label)
             })
+            .filter(|(value, _)| (low..=high).contains(value))
             .collect()
     }
 }
