@@ -83,8 +83,10 @@ impl Material {
         for layer in &self.layers {
             let texture = layer.texture.texture();
             let by_texel = 1.0 / layer.texel_m;
-            let place = place.map(|p| p * by_texel);
-            let footprint = Footprint::new(cov_m2.map(|c| c * by_texel * by_texel));
+            let place = [place[0] * by_texel, place[1] * by_texel];
+            let by_texel2 = by_texel * by_texel;
+            let [xx, xy, yy] = cov_m2;
+            let footprint = Footprint::new([xx * by_texel2, xy * by_texel2, yy * by_texel2]);
             let deviation = if layer.periodic {
                 texture.sample(&footprint, place) - texture.mean()
             } else {

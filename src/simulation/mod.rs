@@ -16,6 +16,7 @@
 //! faster.
 
 mod dataset_writer;
+mod kernel;
 mod material;
 mod pattern;
 pub mod points;

@@ -71,16 +71,15 @@ impl RayMap {
     }
 
     /// The ray of a pixel; not finite where the lens' model has no inverse.
+    #[inline]
     pub(super) fn at(&self, x: usize, y: usize) -> [f64; 2] {
-        self.rays[y * self.width + x].map(f64::from)
+        let [a, b] = self.rays[y * self.width + x];
+        [f64::from(a), f64::from(b)]
     }
 
     /// The ray's derivative by the pixel's column and by its row, 1/px.
+    #[inline]
     pub(super) fn derivative(&self, x: usize, y: usize) -> [[f64; 2]; 2] {
-        let slope = |a: [f64; 2], b: [f64; 2], span: usize| {
-            let by = 1.0 / span.max(1) as f64;
-            [(b[0] - a[0]) * by, (b[1] - a[1]) * by]
-        };
         let (left, right) = (x.saturating_sub(1), (x + 1).min(self.width - 1));
         let (up, down) = (y.saturating_sub(1), (y + 1).min(self.height - 1));
         [
@@ -116,4 +115,10 @@ impl RayMap {
             cos_half: half.cos(),
         })
     }
+}
+
+#[inline]
+fn slope(from: [f64; 2], to: [f64; 2], span: usize) -> [f64; 2] {
+    let by = if span == 2 { 0.5 } else { 1.0 };
+    [(to[0] - from[0]) * by, (to[1] - from[1]) * by]
 }

@@ -155,7 +155,8 @@ impl Renderer {
             return if surface == SKY { scene.sky } else { 0.0 };
         };
         let footing = seen.footing(ray, &self.rays.derivative(x, y), SIGMA_PX);
-        if !footing.cov_m2.iter().all(|c| c.is_finite()) {
+        let [xx, _, yy] = footing.cov_m2;
+        if !(xx + yy).is_finite() {
             return 0.0;
         }
         let face = &scene.faces[seen.face];
@@ -193,7 +194,7 @@ impl Renderer {
             .iter()
             .map(|share| {
                 let by_count = 1.0 / f64::from(share.count);
-                let ray = share.ray.map(|r| r * by_count);
+                let ray = [share.ray[0] * by_count, share.ray[1] * by_count];
                 let part = share.count as f32 / EDGE_RAYS as f32;
                 part * self.surface(scene, view, share.surface, [x, y], ray)
             })

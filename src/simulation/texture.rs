@@ -8,10 +8,10 @@
 //! aliases, no level shows where it ends, and a sub-pixel shift of the camera is one of the image.
 //! Levels also come narrowed along x, in which direction foreshortened surfaces lie.
 
+use super::kernel::{Placement, weighted_mean};
+
 /// Texels that each row is continued by on either side, so that a kernel never has to wrap.
 const PAD: usize = 72;
-/// Texels handled at once: what every vector unit has.
-const LANES: usize = 4;
 /// The longest that an ellipse may be in its own widths; longer ones are widened.
 const MAX_ANISOTROPY: f64 = 8.0;
 /// Variance, texel², of the smoothing that every level carries: the fixed point of halving with
@@ -49,8 +49,7 @@ pub(super) struct Footprint {
     level: usize,
     narrowing: usize,
     scale: [f64; 2],
-    half_height: f32,
-    half_width: f32,
+    half: [f32; 2],
     shear: f32,
 }
 
@@ -79,8 +78,10 @@ impl Footprint {
             level: level_y as usize,
             narrowing: (level_x - level_y) as usize,
             scale: [scale_x, scale_y],
-            half_height: (KERNEL_SPREAD * kyy).sqrt() as f32,
-            half_width: (KERNEL_SPREAD * kxx_at_y).sqrt() as f32,
+            half: [
+                (KERNEL_SPREAD * kxx_at_y).sqrt() as f32,
+                (KERNEL_SPREAD * kyy).sqrt() as f32,
+            ],
             shear: shear as f32,
         }
     }
@@ -191,48 +192,19 @@ impl Level {
         }
     }
 
-    #[expect(
-        clippy::cast_possible_truncation,
-        clippy::cast_sign_loss,
-        reason = "positions are wrapped into the level before they are cut to integers"
-    )]
     fn sample(&self, footprint: &Footprint, centre: [f64; 2]) -> f32 {
-        let Footprint {
-            half_height,
-            half_width,
-            shear,
-            scale,
-            ..
-        } = *footprint;
-        let cx = wrap(centre[0] * scale[0], self.width);
-        let cy = wrap(centre[1] * scale[1], self.height);
-        let (by_height2, by_width2) = (
-            1.0 / (half_height * half_height),
-            1.0 / (half_width * half_width),
-        );
-        let stride = self.width + 2 * PAD;
-        // The centre plus the padding is above 0, so that cutting its fraction off rounds down.
-        const PADDING: f32 = PAD as f32;
-        let chunks = (2.0 * half_width) as usize / LANES + 1;
-        let mut sums = [Lanes::splat(0.0); 2];
-        let last = (cy + half_height + PADDING) as usize;
-        for row in (cy - half_height + PADDING) as usize + 1..=last {
-            let dy = row as f32 - PADDING - cy;
-            let root = 1.0 - dy * dy * by_height2;
-            let middle = cx + shear * dy + PADDING;
-            let first = (middle - half_width) as usize + 1;
-            let start = (row.wrapping_sub(PAD) & (self.height - 1)) * stride + first;
-            let texels = &self.texels[start..start + chunks * LANES];
-            weigh(
-                texels,
-                first as f32 - middle,
-                by_width2,
-                root * root,
-                &mut sums,
-            );
-        }
-        let [weights, values] = sums;
-        values.sum() / weights.sum()
+        let at = Placement {
+            middle: [
+                wrap(centre[0] * footprint.scale[0], self.width),
+                wrap(centre[1] * footprint.scale[1], self.height),
+            ],
+            half: footprint.half,
+            shear: footprint.shear,
+            stride: self.width + 2 * PAD,
+            row_mask: self.height - 1,
+            pad: PAD,
+        };
+        weighted_mean(&self.texels, &at)
     }
 }
 
@@ -246,81 +218,6 @@ fn wrap(c: f64, size: usize) -> f32 {
     // Cutting off the fraction rounds towards zero; one less is below any coordinate.
     let whole = (turns as i64 - i64::from(turns < 0.0)) as f64;
     ((turns - whole) * size as f64) as f32
-}
-
-/// Adds to `sums`, lane by lane, the kernel's weights along a row and the weighted texels. The
-/// first texel lies `dx` from the kernel's middle.
-///
-/// Not inlined: on its own it becomes a dozen vector instructions, but not in the loop around it.
-#[inline(never)]
-fn weigh(texels: &[f32], dx: f32, by_width2: f32, weight_y: f32, sums: &mut [Lanes; 2]) {
-    let mut dx = Lanes([dx, dx + 1.0, dx + 2.0, dx + 3.0]);
-    let by_width2 = Lanes::splat(by_width2);
-    let (mut weights, mut values) = (Lanes::splat(0.0), Lanes::splat(0.0));
-    for chunk in texels.as_chunks::<LANES>().0 {
-        let root = (Lanes::splat(1.0) - dx * dx * by_width2).twice_or_zero();
-        let weight = root * root;
-        weights = weights + weight;
-        values = values + weight * Lanes(*chunk);
-        dx = dx + Lanes::splat(LANES as f32);
-    }
-    let weight_y = Lanes::splat(weight_y);
-    sums[0] = sums[0] + weights * weight_y;
-    sums[1] = sums[1] + values * weight_y;
-}
-
-/// Four numbers that are treated alike, which compilers put into one register.
-#[derive(Clone, Copy)]
-struct Lanes([f32; LANES]);
-
-impl Lanes {
-    #[inline(always)]
-    fn splat(value: f32) -> Self {
-        Self([value; LANES])
-    }
-
-    #[inline(always)]
-    fn with(self, other: Self, f: impl Fn(f32, f32) -> f32) -> Self {
-        let (a, b) = (self.0, other.0);
-        Self([f(a[0], b[0]), f(a[1], b[1]), f(a[2], b[2]), f(a[3], b[3])])
-    }
-
-    /// Zero instead of what is negative, and twice the rest: without a branch.
-    #[inline(always)]
-    fn twice_or_zero(self) -> Self {
-        self.with(self, |v, _| v + v.abs())
-    }
-
-    fn sum(self) -> f32 {
-        self.0.iter().sum()
-    }
-}
-
-impl std::ops::Add for Lanes {
-    type Output = Self;
-
-    #[inline(always)]
-    fn add(self, other: Self) -> Self {
-        self.with(other, |a, b| a + b)
-    }
-}
-
-impl std::ops::Sub for Lanes {
-    type Output = Self;
-
-    #[inline(always)]
-    fn sub(self, other: Self) -> Self {
-        self.with(other, |a, b| a - b)
-    }
-}
-
-impl std::ops::Mul for Lanes {
-    type Output = Self;
-
-    #[inline(always)]
-    fn mul(self, other: Self) -> Self {
-        self.with(other, |a, b| a * b)
-    }
 }
 
 /// Half as wide: the binomial kernel `1 4 6 4 1` around every second texel of each row.
@@ -429,33 +326,6 @@ mod tests {
             for c in [0.0, 0.001, 31.5, 63.999] {
                 assert!(texture.sample(&footprint, [c, c]).is_finite());
             }
-        }
-    }
-}
-#[cfg(test)]
-mod bench {
-    use super::*;
-    #[test]
-    #[ignore]
-    fn bench() {
-        let t = Texture::new(1024, &vec![0.5; 1024 * 1024]);
-        for cov in [
-            [1.1, 0.0, 1.1],
-            [2.0, 0.0, 2.0],
-            [3.9, 0.0, 3.9],
-            [128.0, 0.0, 2.0],
-            [64.0, 62.0, 64.0],
-        ] {
-            let start = std::time::Instant::now();
-            let mut s = 0.0;
-            for k in 0..1_000_000 {
-                let f = Footprint::new(std::hint::black_box(cov));
-                s += t.sample(&f, [(k % 1000) as f64 * 0.7, (k / 1000) as f64 * 0.7]);
-            }
-            println!(
-                "{cov:?} {:?} ns/sample {s}",
-                start.elapsed().as_secs_f64() * 1e3
-            );
         }
     }
 }

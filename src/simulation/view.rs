@@ -86,6 +86,11 @@ impl View {
         candidates.retain(|&index| {
             Some(index) == cover || self.faces[index].inverse_range(cone).1 > covered_from
         });
+        // Near ones first: behind what a ray has met already, one dot product refuses a face.
+        candidates.sort_by_cached_key(|&index| {
+            let middle = self.faces[index].inverse_depth.dot(&cone.axis);
+            std::cmp::Reverse(middle.max(0.0).to_bits())
+        });
         cover.is_some() && candidates.len() == 1
     }
 
@@ -94,8 +99,7 @@ impl View {
         let mut nearest = None;
         let mut inverse_depth = 0.0;
         for &index in candidates {
-            let hit = self.faces[index].hit(ray);
-            if hit > inverse_depth {
+            if let Some(hit) = self.faces[index].hit_before(ray, inverse_depth) {
                 inverse_depth = hit;
                 nearest = Some(index);
             }
@@ -162,20 +166,20 @@ impl SeenFace {
         (least, most)
     }
 
-    /// The inverse depth, 1/m, at which `ray` meets the face; 0 where it does not.
-    fn hit(&self, ray: [f64; 2]) -> f64 {
+    /// The inverse depth, 1/m, at which `ray` meets the face, if it is above `least`.
+    #[inline]
+    fn hit_before(&self, ray: [f64; 2], least: f64) -> Option<f64> {
         let inverse_depth = linear(&self.inverse_depth, ray);
+        if inverse_depth <= least || inverse_depth >= 1.0 / NEAREST_M {
+            return None;
+        }
         let across = linear(&self.across, ray);
         let along = linear(&self.along, ray);
         let inside = across >= 0.0
             && along >= 0.0
             && across <= self.size_m[0] * inverse_depth
             && along <= self.size_m[1] * inverse_depth;
-        if inside && inverse_depth > 0.0 && inverse_depth < 1.0 / NEAREST_M {
-            inverse_depth
-        } else {
-            0.0
-        }
+        inside.then_some(inverse_depth)
     }
 
     /// The depth, m, of the face's plane along `ray`.
@@ -197,9 +201,10 @@ impl SeenFace {
             linear(&self.along, ray) * depth,
         ];
         // Derivative of (across / inverse depth), times the point spread.
+        let by = sigma_px * depth;
+        let w = &self.inverse_depth;
         let step = |d: &[f64; 2], form: &Vector3<f64>, at: f64| {
-            let along_step = |f: &Vector3<f64>| f.x * d[0] + f.y * d[1];
-            sigma_px * depth * (along_step(form) - at * along_step(&self.inverse_depth))
+            by * ((form.x - at * w.x) * d[0] + (form.y - at * w.y) * d[1])
         };
         let [dx, dy] = derivative;
         let (ax, ay) = (
@@ -217,6 +222,7 @@ impl SeenFace {
     }
 }
 
+#[inline]
 fn linear(form: &Vector3<f64>, ray: [f64; 2]) -> f64 {
     form.x * ray[0] + form.y * ray[1] + form.z
 }
