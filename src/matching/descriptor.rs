@@ -1,21 +1,35 @@
 //! Comparing descriptors: distance, the best of several candidates, and the tests a match passes.
 
 use super::Settings;
-use crate::features::{Features, Keypoint};
+use crate::features::Keypoint;
 
 /// Lanes of partial sums: the compiler turns them into vector registers, and the fixed order of
 /// additions keeps the bits the same everywhere.
 const LANES: usize = 16;
 
-/// Squared Euclidean distance of two descriptors of equal length.
-pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
+/// Blocks of lanes between two looks at what the sum has come to.
+const BLOCKS_A_LOOK: usize = 2;
+
+/// Squared Euclidean distance of two descriptors of equal length; `None` if it exceeds `reach`, which
+/// most often shows long before the end.
+///
+/// Partial sums never shrink, not even by rounding: what exceeds `reach` half-way does so at the end.
+pub(super) fn squared_distance_within(a: &[f32], b: &[f32], reach: f32) -> Option<f32> {
     let mut sums = [0.0_f32; LANES];
     let (a_blocks, a_rest) = a.as_chunks::<LANES>();
     let (b_blocks, b_rest) = b.as_chunks::<LANES>();
-    for (x, y) in a_blocks.iter().zip(b_blocks) {
-        for lane in 0..LANES {
-            let d = x[lane] - y[lane];
-            sums[lane] += d * d;
+    let looks = a_blocks
+        .chunks(BLOCKS_A_LOOK)
+        .zip(b_blocks.chunks(BLOCKS_A_LOOK));
+    for (xs, ys) in looks {
+        for (x, y) in xs.iter().zip(ys) {
+            for lane in 0..LANES {
+                let d = x[lane] - y[lane];
+                sums[lane] += d * d;
+            }
+        }
+        if total(sums) > reach {
+            return None;
         }
     }
     let rest: f32 = a_rest
@@ -23,6 +37,12 @@ pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
         .zip(b_rest)
         .map(|(x, y)| (x - y) * (x - y))
         .sum();
+    let squared = total(sums) + rest;
+    (squared <= reach).then_some(squared)
+}
+
+/// The sum over all lanes, in a fixed order.
+fn total(mut sums: [f32; LANES]) -> f32 {
     let mut width = LANES / 2;
     while width > 0 {
         for lane in 0..width {
@@ -30,7 +50,14 @@ pub(super) fn squared_distance(a: &[f32], b: &[f32]) -> f32 {
         }
         width /= 2;
     }
-    sums[0] + rest
+    sums[0]
+}
+
+/// The squared distance beyond which a candidate can neither be accepted nor stand in the way of
+/// another that can: √(this) × `max_ratio` is `max_distance`, and a little more for rounding.
+pub(super) fn greatest_reach(settings: &Settings) -> f32 {
+    let reach = settings.max_distance / settings.max_ratio;
+    reach * reach * (1.0 + 1e-5)
 }
 
 /// The best and the second best candidate of one feature.
@@ -48,6 +75,11 @@ impl Best {
         squared: f32::INFINITY,
         second_squared: f32::INFINITY,
     };
+
+    /// The squared distance that a candidate must undercut to be taken note of.
+    pub(super) fn second_squared(&self) -> f32 {
+        self.second_squared
+    }
 
     /// Takes note of a candidate.
     pub(super) fn offer(&mut self, index: u32, squared: f32) {
@@ -78,11 +110,6 @@ pub(super) fn compatible(a: &Keypoint, b: &Keypoint, settings: &Settings) -> boo
         && b.size_px <= a.size_px * settings.max_size_ratio
 }
 
-/// The distance of feature `i` of `a` to feature `j` of `b`, squared.
-pub(super) fn distance_between(a: &Features, i: u32, b: &Features, j: u32) -> f32 {
-    squared_distance(a.descriptor(i as usize), b.descriptor(j as usize))
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -95,7 +122,40 @@ mod tests {
         ) {
             let (a, b): (Vec<f32>, Vec<f32>) = pairs.iter().copied().unzip();
             let plain: f64 = pairs.iter().map(|(x, y)| f64::from(x - y).powi(2)).sum();
-            prop_assert!((f64::from(squared_distance(&a, &b)) - plain).abs() <= 1e-5 * plain.max(1.0));
+            let found = squared_distance_within(&a, &b, f32::INFINITY).expect("within reach");
+            prop_assert!((f64::from(found) - plain).abs() <= 1e-5 * plain.max(1.0));
+        }
+
+        #[test]
+        fn looking_early_changes_no_bit(
+            pairs in prop::collection::vec((-1.0..1.0_f32, -1.0..1.0_f32), 0..200),
+            share in 0.0..2.0_f32,
+        ) {
+            let (a, b): (Vec<f32>, Vec<f32>) = pairs.iter().copied().unzip();
+            let all = squared_distance_within(&a, &b, f32::INFINITY).expect("within reach");
+            for reach in [share * all, all, all.next_down(), all.next_up()] {
+                let found = squared_distance_within(&a, &b, reach);
+                prop_assert_eq!(found, (all <= reach).then_some(all));
+            }
+        }
+
+        /// Whatever is out of reach, and whichever candidate it is, leaves the choice as it was.
+        #[test]
+        fn candidates_out_of_reach_decide_nothing(
+            squares in prop::collection::vec(0.0..2.0_f32, 1..8),
+            max_ratio in 0.1..1.0_f32, max_distance in 0.0..2.0_f32,
+        ) {
+            let settings = Settings { max_ratio, max_distance, ..Settings::default() };
+            let choice = |reach: f32| {
+                let mut best = Best::NONE;
+                for (i, &squared) in squares.iter().enumerate() {
+                    if squared <= reach {
+                        best.offer(i as u32, squared);
+                    }
+                }
+                best.accepted(&settings)
+            };
+            prop_assert_eq!(choice(greatest_reach(&settings)), choice(f32::INFINITY));
         }
     }
 

@@ -39,8 +39,8 @@ impl Settings {
     /// # Errors
     /// The first knob whose value lies outside.
     pub fn check(&self) -> Result<(), SettingError> {
-        SettingError::unless_in("trees", self.trees, 1..=64)?;
-        SettingError::unless_in("checks", self.checks, 1..=100_000)
+        SettingError::unless_in("flann.trees", self.trees, 1..=64)?;
+        SettingError::unless_in("flann.checks", self.checks, 1..=100_000)
     }
 }
 
@@ -153,6 +153,24 @@ impl FlannMatcher {
             .filter(|(_, [first, second])| first.distance < max_ratio * second.distance)
             .map(|(query, [nearest, _])| Match { query, nearest })
             .collect())
+    }
+
+    /// The pairs, by index into `a` and into `b`, of which one is among the two nearest neighbours
+    /// of the other: each once, in order.
+    ///
+    /// # Errors
+    /// As [`Self::knn2`].
+    pub fn neighbours(&self, a: &Features, b: &Features) -> Result<Vec<(u32, u32)>, FlannError> {
+        let numbered = |neighbours: Vec<[Neighbour; 2]>| {
+            (0..)
+                .zip(neighbours)
+                .flat_map(|(query, two)| two.map(|n| (query, n.index as u32)))
+        };
+        let mut pairs: Vec<(u32, u32)> = numbered(self.knn2(a, b)?).collect();
+        pairs.extend(numbered(self.knn2(b, a)?).map(|(j, i)| (i, j)));
+        pairs.sort_unstable();
+        pairs.dedup();
+        Ok(pairs)
     }
 
     fn search(&self, query: &Features, train: &Features) -> opencv::Result<Vec<[Neighbour; 2]>> {

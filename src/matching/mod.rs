@@ -3,14 +3,23 @@
 //! A *stereo match* joins a left and a right feature of one pair; a *track* joins a stereo match
 //! of an earlier pair with one of this pair, and has passed the circle left now – right now – right
 //! before – left before. Everything is found among few candidates: left–right in a narrow band of
-//! rectified rows, over time near the predicted position. No image is resampled.
+//! rectified rows, over time near the predicted position. No image is resampled. OpenCV's FLANN may
+//! propose the candidates instead, where that was built in; they pass the same gates.
 
+mod candidates;
 mod descriptor;
 #[cfg(feature = "opencv")]
 pub mod flann;
+mod grid;
+mod pairing;
 mod stereo;
+#[cfg(test)]
+pub(crate) mod synthetic;
 mod temporal;
+#[cfg(test)]
+mod tests;
 
+pub use candidates::{MatchError, MatcherName};
 pub use stereo::{StereoMatch, StereoMatcher};
 pub use temporal::{MatchedPair, TemporalMatcher, Track};
 
@@ -21,6 +30,10 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
+    /// Where candidates come from: "guided", from where geometry expects them, or "flann", from the
+    /// two nearest descriptors by OpenCV's FLANN where that was built in. Default "guided": FLANN
+    /// is slower, and misses what repeats itself elsewhere in the image.
+    pub matcher: MatcherName,
     /// Greatest ratio of the best descriptor distance to the second best among the candidates of
     /// one feature. No unit, 0.1 to 1, default 0.85: candidates are few, so that a stricter test
     /// loses good matches without catching more bad ones.
@@ -46,11 +59,19 @@ pub struct Settings {
     pub wide_search: f64,
     /// Largest ratio of the sizes of matched keypoints. No unit, 1 to 10, default 1.6.
     pub max_size_ratio: f32,
+    /// Settings of FLANN.
+    #[cfg(feature = "opencv")]
+    pub flann: flann::Settings,
+    /// Settings of FLANN, which was not built in: refused, with the reason.
+    #[cfg(not(feature = "opencv"))]
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub flann: Option<toml::Table>,
 }
 
 impl Default for Settings {
     fn default() -> Self {
         Self {
+            matcher: MatcherName::default(),
             max_ratio: 0.85,
             max_distance: 0.6,
             row_band_px: 2.0,
@@ -60,15 +81,16 @@ impl Default for Settings {
             search_radius_px: 40.0,
             wide_search: 0.25,
             max_size_ratio: 1.6,
+            flann: Default::default(),
         }
     }
 }
 
 impl Settings {
-    /// Refuses values out of range.
+    /// Refuses values out of range, and FLANN where it was not built in.
     ///
     /// # Errors
-    /// The first setting out of range.
+    /// The first setting that cannot be used.
     pub fn check(&self) -> Result<(), SettingError> {
         SettingError::unless_in("max_ratio", self.max_ratio, 0.1..=1.0)?;
         SettingError::unless_in("max_distance", self.max_distance, 0.0..=2.0)?;
@@ -78,6 +100,16 @@ impl Settings {
         SettingError::unless_in("min_depth_m", self.min_depth_m, 0.01..=100.0)?;
         SettingError::unless_in("search_radius_px", self.search_radius_px, 1.0..=4096.0)?;
         SettingError::unless_in("wide_search", self.wide_search, 0.01..=1.0)?;
-        SettingError::unless_in("max_size_ratio", self.max_size_ratio, 1.0..=10.0)
+        SettingError::unless_in("max_size_ratio", self.max_size_ratio, 1.0..=10.0)?;
+        #[cfg(feature = "opencv")]
+        self.flann.check()?;
+        #[cfg(not(feature = "opencv"))]
+        if self.flann.is_some() || self.matcher != MatcherName::Guided {
+            return Err(SettingError {
+                key: "matcher",
+                cause: MatchError::NotBuiltIn.to_string(),
+            });
+        }
+        Ok(())
     }
 }

@@ -5,8 +5,9 @@
 //! band and disparity range: cost grows as features × features per band.
 
 use super::Settings;
-use super::descriptor::{Best, compatible, distance_between};
-use crate::features::Features;
+use super::candidates::{MatchError, Window};
+use super::pairing::{Chosen, Pairing};
+use crate::features::{Features, Keypoint};
 use crate::geometry::Rectification;
 use nalgebra::Vector2;
 
@@ -24,17 +25,8 @@ pub struct StereoMatch {
 pub struct StereoMatcher {
     settings: Settings,
     rectification: Rectification,
-    left: Vec<Option<Vector2<f64>>>,
-    right: Vec<RightFeature>,
-    best_right: Vec<Option<u32>>,
-    best_left: Vec<Best>,
-}
-
-#[derive(Clone, Copy, Debug)]
-struct RightFeature {
-    index: u32,
-    x_px: f64,
-    y_px: f64,
+    band: EpipolarBand,
+    pairing: Pairing,
 }
 
 impl StereoMatcher {
@@ -42,85 +34,138 @@ impl StereoMatcher {
     #[must_use]
     pub fn new(settings: Settings, rectification: Rectification) -> Self {
         Self {
+            band: EpipolarBand::default(),
+            pairing: Pairing::new(settings.clone()),
             settings,
             rectification,
-            left: Vec::new(),
-            right: Vec::new(),
-            best_right: Vec::new(),
-            best_left: Vec::new(),
         }
     }
 
     /// Finds the stereo matches of a pair, in the order of its left features, replacing what
     /// `matches` held. Each feature is in one match at most.
-    pub fn find(&mut self, left: &Features, right: &Features, matches: &mut Vec<StereoMatch>) {
-        self.rectify(left, right);
-        self.search(left, right);
+    ///
+    /// # Errors
+    /// FLANN was asked for and failed; `matches` is then empty.
+    pub fn find(
+        &mut self,
+        left: &Features,
+        right: &Features,
+        matches: &mut Vec<StereoMatch>,
+    ) -> Result<(), MatchError> {
         matches.clear();
-        for (i, best) in self.best_right.iter().enumerate() {
-            let Some(j) = *best else { continue };
-            // Mutual: of all left features, the right one must like this one best.
-            if self.best_left[j as usize].accepted(&self.settings) == Some(i as u32) {
-                matches.push(StereoMatch {
-                    left: i as u32,
-                    right: j,
-                });
-            }
-        }
+        self.band
+            .fill(&self.settings, &self.rectification, left, right);
+        self.pairing.search(&all(left), &all(right), &self.band)?;
+        matches.extend((0..left.len() as u32).filter_map(|left| {
+            let right = self.pairing.partner(left)?;
+            Some(StereoMatch { left, right })
+        }));
+        Ok(())
     }
+}
 
-    fn rectify(&mut self, left: &Features, right: &Features) {
+fn all(features: &Features) -> Chosen<'_, impl Fn(u32) -> u32> {
+    Chosen {
+        features,
+        count: features.len() as u32,
+        feature_of: |i| i,
+    }
+}
+
+/// The window left–right: a band of rectified rows, and a range of disparities.
+#[derive(Debug, Default)]
+struct EpipolarBand {
+    min_disparity_px: f64,
+    max_disparity_px: f64,
+    left: Vec<Option<LeftSight>>,
+    right: Vec<Option<RightSight>>,
+    /// The right ones by row.
+    right_by_row: Vec<RightSight>,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct LeftSight {
+    x_px: f64,
+    top_px: f64,
+    bottom_px: f64,
+}
+
+#[derive(Clone, Copy, Debug)]
+struct RightSight {
+    index: u32,
+    x_px: f64,
+    y_px: f64,
+}
+
+impl EpipolarBand {
+    fn fill(
+        &mut self,
+        settings: &Settings,
+        rectification: &Rectification,
+        left: &Features,
+        right: &Features,
+    ) {
+        self.min_disparity_px = settings.min_disparity_px;
+        self.max_disparity_px = rectification.disparity_px(settings.min_depth_m);
         self.left.clear();
         self.left.extend(left.keypoints.iter().map(|k| {
-            self.rectification
-                .left(&Vector2::new(f64::from(k.x_px), f64::from(k.y_px)))
+            let at = rectification.left(&raw_px(k))?;
+            let half_px = settings
+                .row_band_px
+                .max(settings.row_band_sigmas * f64::from(k.sigma_px));
+            Some(LeftSight {
+                x_px: at.x,
+                top_px: at.y - half_px,
+                bottom_px: at.y + half_px,
+            })
         }));
         self.right.clear();
-        for (index, k) in right.keypoints.iter().enumerate() {
-            let raw_px = Vector2::new(f64::from(k.x_px), f64::from(k.y_px));
-            if let Some(p) = self.rectification.right(&raw_px) {
-                self.right.push(RightFeature {
-                    index: index as u32,
-                    x_px: p.x,
-                    y_px: p.y,
-                });
-            }
-        }
         self.right
+            .extend((0..).zip(&right.keypoints).map(|(index, k)| {
+                let at = rectification.right(&raw_px(k))?;
+                Some(RightSight {
+                    index,
+                    x_px: at.x,
+                    y_px: at.y,
+                })
+            }));
+        self.right_by_row.clear();
+        self.right_by_row.extend(self.right.iter().flatten());
+        self.right_by_row
             .sort_unstable_by(|a, b| a.y_px.total_cmp(&b.y_px).then(a.index.cmp(&b.index)));
     }
 
-    fn search(&mut self, left: &Features, right: &Features) {
-        let max_disparity_px = self.rectification.disparity_px(self.settings.min_depth_m);
-        self.best_right.clear();
-        self.best_left.clear();
-        self.best_left.resize(right.len(), Best::NONE);
-        for (i, (keypoint, position)) in left.keypoints.iter().zip(&self.left).enumerate() {
-            let mut best = Best::NONE;
-            if let Some(p) = position {
-                let band_px = self
-                    .settings
-                    .row_band_px
-                    .max(self.settings.row_band_sigmas * f64::from(keypoint.sigma_px));
-                let from = self.right.partition_point(|r| r.y_px < p.y - band_px);
-                for candidate in &self.right[from..] {
-                    if candidate.y_px > p.y + band_px {
-                        break;
-                    }
-                    let disparity_px = p.x - candidate.x_px;
-                    let j = candidate.index;
-                    if disparity_px < self.settings.min_disparity_px
-                        || disparity_px > max_disparity_px
-                        || !compatible(keypoint, &right.keypoints[j as usize], &self.settings)
-                    {
-                        continue;
-                    }
-                    let squared = distance_between(left, i as u32, right, j);
-                    best.offer(j, squared);
-                    self.best_left[j as usize].offer(i as u32, squared);
-                }
+    fn has_disparity_in_range(&self, left: &LeftSight, right: &RightSight) -> bool {
+        let disparity_px = left.x_px - right.x_px;
+        self.min_disparity_px <= disparity_px && disparity_px <= self.max_disparity_px
+    }
+}
+
+impl Window for EpipolarBand {
+    fn for_each_in(&self, i: u32, mut visit: impl FnMut(u32)) {
+        let Some(left) = &self.left[i as usize] else {
+            return;
+        };
+        let from = self.right_by_row.partition_point(|r| r.y_px < left.top_px);
+        for right in &self.right_by_row[from..] {
+            if right.y_px > left.bottom_px {
+                return;
             }
-            self.best_right.push(best.accepted(&self.settings));
+            if self.has_disparity_in_range(left, right) {
+                visit(right.index);
+            }
         }
     }
+
+    fn holds(&self, i: u32, j: u32) -> bool {
+        let (Some(left), Some(right)) = (&self.left[i as usize], &self.right[j as usize]) else {
+            return false;
+        };
+        (left.top_px..=left.bottom_px).contains(&right.y_px)
+            && self.has_disparity_in_range(left, right)
+    }
+}
+
+fn raw_px(keypoint: &Keypoint) -> Vector2<f64> {
+    Vector2::new(f64::from(keypoint.x_px), f64::from(keypoint.y_px))
 }

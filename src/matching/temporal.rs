@@ -4,7 +4,9 @@
 //! kept only if both sides agree on it. Candidates come from a grid over the image, so that cost
 //! grows as matches × matches per search window.
 
-use super::descriptor::{Best, compatible, distance_between};
+use super::candidates::{MatchError, Window};
+use super::grid::Grid;
+use super::pairing::{Chosen, Pairing};
 use super::{Settings, StereoMatch};
 use crate::features::Features;
 use nalgebra::{Vector2, Vector4};
@@ -32,7 +34,6 @@ pub struct MatchedPair<'a> {
 /// Finds tracks; keeps its working memory from pair to pair.
 #[derive(Debug)]
 pub struct TemporalMatcher {
-    settings: Settings,
     left: SideSearch,
     right: SideSearch,
 }
@@ -42,9 +43,8 @@ impl TemporalMatcher {
     #[must_use]
     pub fn new(settings: Settings) -> Self {
         Self {
-            settings,
-            left: SideSearch::default(),
-            right: SideSearch::default(),
+            left: SideSearch::new(settings.clone()),
+            right: SideSearch::new(settings),
         }
     }
 
@@ -53,6 +53,9 @@ impl TemporalMatcher {
     ///
     /// `predicted` holds, for each of the earlier matches, where its point should now be seen
     /// (ul, vl, ur, vr), px, or `None` where it should not; each is sought within `radius_px`.
+    ///
+    /// # Errors
+    /// FLANN was asked for and failed; `tracks` is then empty.
     pub fn find(
         &mut self,
         before: MatchedPair<'_>,
@@ -60,203 +63,95 @@ impl TemporalMatcher {
         predicted: &[Option<Vector4<f64>>],
         radius_px: f64,
         tracks: &mut Vec<Track>,
-    ) {
-        let settings = &self.settings;
-        self.left.search(
-            SideFeatures {
-                before: before.left,
-                now: now.left,
-                feature_before: |m| before.matches[m as usize].left,
-                feature_now: |m| now.matches[m as usize].left,
-            },
-            now.matches.len(),
-            |m| predicted[m].map(|p| p.xy()),
-            predicted.len(),
-            radius_px,
-            settings,
-        );
-        self.right.search(
-            SideFeatures {
-                before: before.right,
-                now: now.right,
-                feature_before: |m| before.matches[m as usize].right,
-                feature_now: |m| now.matches[m as usize].right,
-            },
-            now.matches.len(),
-            |m| predicted[m].map(|p| p.fixed_rows::<2>(2).into_owned()),
-            predicted.len(),
-            radius_px,
-            settings,
-        );
+    ) -> Result<(), MatchError> {
         tracks.clear();
-        for m in 0..predicted.len() {
-            let Some(n) = self.left.partner(m, settings) else {
-                continue;
-            };
+        self.left.search(
+            &before.chosen(before.left, |m| m.left),
+            &now.chosen(now.left, |m| m.left),
+            |m| predicted[m as usize].map(|p| p.xy()),
+            radius_px,
+        )?;
+        self.right.search(
+            &before.chosen(before.right, |m| m.right),
+            &now.chosen(now.right, |m| m.right),
+            |m| predicted[m as usize].map(|p| p.fixed_rows::<2>(2).into_owned()),
+            radius_px,
+        )?;
+        tracks.extend((0..before.matches.len() as u32).filter_map(|before| {
+            let now = self.left.pairing.partner(before)?;
             // The circle: the right side must lead from the same earlier match to the same one now.
-            if self.right.partner(m, settings) == Some(n) {
-                tracks.push(Track {
-                    before: m as u32,
-                    now: n,
-                });
-            }
+            (self.right.pairing.partner(before)? == now).then_some(Track { before, now })
+        }));
+        Ok(())
+    }
+}
+
+impl<'a> MatchedPair<'a> {
+    /// The features of one side, numbered as the matches are.
+    fn chosen(
+        &self,
+        features: &'a Features,
+        side: impl Fn(&StereoMatch) -> u32,
+    ) -> Chosen<'a, impl Fn(u32) -> u32> {
+        let matches = self.matches;
+        Chosen {
+            features,
+            count: matches.len() as u32,
+            feature_of: move |m| side(&matches[m as usize]),
         }
     }
 }
 
-/// What one side's search reads.
-struct SideFeatures<'a, B, N> {
-    before: &'a Features,
-    now: &'a Features,
-    feature_before: B,
-    feature_now: N,
-}
-
-/// The search on one side: best partners both ways, in numbers of stereo matches.
-#[derive(Debug, Default)]
+/// The search on one side, in numbers of stereo matches.
+#[derive(Debug)]
 struct SideSearch {
     grid: Grid,
-    now_of_before: Vec<Best>,
-    before_of_now: Vec<Best>,
+    pairing: Pairing,
 }
 
 impl SideSearch {
+    fn new(settings: Settings) -> Self {
+        Self {
+            grid: Grid::default(),
+            pairing: Pairing::new(settings),
+        }
+    }
+
     fn search<B: Fn(u32) -> u32, N: Fn(u32) -> u32>(
         &mut self,
-        features: SideFeatures<'_, B, N>,
-        now_count: usize,
-        predicted: impl Fn(usize) -> Option<Vector2<f64>>,
-        before_count: usize,
+        before: &Chosen<'_, B>,
+        now: &Chosen<'_, N>,
+        predicted: impl Fn(u32) -> Option<Vector2<f64>>,
         radius_px: f64,
-        settings: &Settings,
-    ) {
-        self.grid.fill((0..now_count as u32).map(|n| {
-            let k = &features.now.keypoints[(features.feature_now)(n) as usize];
+    ) -> Result<(), MatchError> {
+        self.grid.fill((0..now.count).map(|n| {
+            let k = now.keypoint(n);
             (n, k.x_px, k.y_px)
         }));
-        self.now_of_before.clear();
-        self.now_of_before.resize(before_count, Best::NONE);
-        self.before_of_now.clear();
-        self.before_of_now.resize(now_count, Best::NONE);
-        for m in 0..before_count {
-            let Some(at) = predicted(m) else { continue };
-            let i = (features.feature_before)(m as u32);
-            let keypoint = &features.before.keypoints[i as usize];
-            let best = &mut self.now_of_before[m];
-            let before_of_now = &mut self.before_of_now;
-            self.grid.for_each_near(&at, radius_px, |n| {
-                let j = (features.feature_now)(n);
-                if !compatible(keypoint, &features.now.keypoints[j as usize], settings) {
-                    return;
-                }
-                let squared = distance_between(features.before, i, features.now, j);
-                best.offer(n, squared);
-                before_of_now[n as usize].offer(m as u32, squared);
-            });
-        }
-    }
-
-    /// The match now that goes with `m` of before, if each likes the other best.
-    fn partner(&self, m: usize, settings: &Settings) -> Option<u32> {
-        let n = self.now_of_before[m].accepted(settings)?;
-        (self.before_of_now[n as usize].accepted(settings)? == m as u32).then_some(n)
-    }
-}
-
-/// Side of a grid cell, px.
-const CELL_PX: f32 = 32.0;
-
-/// Numbered points sorted into the cells of a grid.
-#[derive(Debug, Default)]
-struct Grid {
-    columns: i32,
-    rows: i32,
-    /// Where each cell's points start in `points`; one more entry than cells.
-    starts: Vec<u32>,
-    points: Vec<(u32, f32, f32)>,
-    unsorted: Vec<(u32, f32, f32)>,
-}
-
-impl Grid {
-    fn fill(&mut self, points: impl Iterator<Item = (u32, f32, f32)>) {
-        self.unsorted.clear();
-        self.unsorted.extend(points);
-        let extent = |get: fn(&(u32, f32, f32)) -> f32| {
-            let max = self.unsorted.iter().map(get).fold(0.0_f32, f32::max);
-            (max / CELL_PX) as i32 + 1
+        let window = SearchCircle {
+            grid: &self.grid,
+            predicted,
+            radius_px,
         };
-        self.columns = extent(|p| p.1);
-        self.rows = extent(|p| p.2);
-        // Counting sort: points of a cell stay in their given order.
-        self.starts.clear();
-        self.starts
-            .resize((self.columns * self.rows) as usize + 1, 0);
-        for p in &self.unsorted {
-            self.starts[cell_of(self.columns, p) + 1] += 1;
-        }
-        for c in 1..self.starts.len() {
-            self.starts[c] += self.starts[c - 1];
-        }
-        self.points.clear();
-        self.points.resize(self.unsorted.len(), (0, 0.0, 0.0));
-        for p in &self.unsorted {
-            let slot = &mut self.starts[cell_of(self.columns, p)];
-            self.points[*slot as usize] = *p;
-            *slot += 1;
-        }
-        // Each start has moved to its cell's end, which is the next cell's start: shift back.
-        self.starts.rotate_right(1);
-        self.starts[0] = 0;
-    }
-
-    fn for_each_near(&self, at: &Vector2<f64>, radius_px: f64, mut visit: impl FnMut(u32)) {
-        let cell = |v: f64| (v as f32 / CELL_PX).floor() as i32;
-        let columns = cell(at.x - radius_px).max(0)..=cell(at.x + radius_px).min(self.columns - 1);
-        for row in cell(at.y - radius_px).max(0)..=cell(at.y + radius_px).min(self.rows - 1) {
-            for column in columns.clone() {
-                let c = (row * self.columns + column) as usize;
-                for &(n, x, y) in &self.points[self.starts[c] as usize..self.starts[c + 1] as usize]
-                {
-                    let offset = Vector2::new(f64::from(x), f64::from(y)) - at;
-                    if offset.norm_squared() <= radius_px * radius_px {
-                        visit(n);
-                    }
-                }
-            }
-        }
+        self.pairing.search(before, now, &window)
     }
 }
 
-fn cell_of(columns: i32, point: &(u32, f32, f32)) -> usize {
-    let column = (point.1.max(0.0) / CELL_PX) as i32;
-    let row = (point.2.max(0.0) / CELL_PX) as i32;
-    (row * columns + column) as usize
+/// The window over time: what lies around a predicted position.
+struct SearchCircle<'a, P> {
+    grid: &'a Grid,
+    predicted: P,
+    radius_px: f64,
 }
 
-#[cfg(test)]
-mod tests {
-    use super::*;
-    use proptest::prelude::*;
-
-    proptest! {
-        #[test]
-        fn grid_finds_what_a_plain_scan_finds(
-            points in prop::collection::vec((0.0..640.0_f32, 0.0..480.0_f32), 0..200),
-            x in -50.0..700.0_f64, y in -50.0..530.0_f64, radius in 0.0..200.0_f64,
-        ) {
-            let mut grid = Grid::default();
-            grid.fill(points.iter().enumerate().map(|(i, p)| (i as u32, p.0, p.1)));
-            let at = Vector2::new(x, y);
-            let mut found = Vec::new();
-            grid.for_each_near(&at, radius, |n| found.push(n));
-            found.sort_unstable();
-            let plain: Vec<u32> = (0..points.len() as u32)
-                .filter(|&i| {
-                    let p = points[i as usize];
-                    (Vector2::new(f64::from(p.0), f64::from(p.1)) - at).norm_squared() <= radius * radius
-                })
-                .collect();
-            prop_assert_eq!(found, plain);
+impl<P: Fn(u32) -> Option<Vector2<f64>>> Window for SearchCircle<'_, P> {
+    fn for_each_in(&self, m: u32, visit: impl FnMut(u32)) {
+        if let Some(at) = (self.predicted)(m) {
+            self.grid.for_each_near(&at, self.radius_px, visit);
         }
+    }
+
+    fn holds(&self, m: u32, n: u32) -> bool {
+        (self.predicted)(m).is_some_and(|at| self.grid.is_near(n, &at, self.radius_px))
     }
 }

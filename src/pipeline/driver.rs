@@ -350,11 +350,13 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 left: left.job.features,
                 right: right.job.features,
             };
-            let unusable = left.failed.or(right.failed);
-            let odometry = if unusable.is_some() {
-                method.skip(stamp)
-            } else {
-                method.step(described)
+            let stepped = match left.failed.or(right.failed) {
+                Some(why) => Err(why),
+                None => method.step(described).map_err(|e| e.to_string()),
+            };
+            let (odometry, unusable) = match stepped {
+                Ok(odometry) => (odometry, None),
+                Err(why) => (method.skip(stamp), Some(why)),
             };
             let times = method.times();
             Some(Outcome {

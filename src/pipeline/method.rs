@@ -10,7 +10,9 @@ use crate::estimation::{
 };
 use crate::features::Features;
 use crate::geometry::{Rectification, StereoRig};
-use crate::matching::{self, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track};
+use crate::matching::{
+    self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
+};
 use nalgebra::{Isometry3, Vector3, Vector4};
 use std::time::{Duration, Instant};
 
@@ -100,21 +102,28 @@ impl Method {
     }
 
     /// Takes the next pair and says where the camera is.
-    pub fn step(&mut self, pair: &mut DescribedPair) -> Odometry {
+    ///
+    /// # Errors
+    /// Its features could not be matched. The method stands as before the pair, which is then to be
+    /// [skipped](Self::skip).
+    pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, MatchError> {
         std::mem::swap(&mut self.now.pair, pair);
         let stamp = self.now.pair.stamp();
         let started = Instant::now();
-        self.match_left_and_right();
+        self.match_left_and_right()?;
         self.triangulate();
         let Some(mut odometer) = self.odometer.take() else {
             let matched = Instant::now();
             let mut odometer = Odometer::new(self.estimation.clone(), stamp);
             let row = odometer.begin(stamp, self.counts(None));
             self.finish(odometer, true, started, matched);
-            return row;
+            return Ok(row);
         };
         let predicted = odometer.predict(stamp.timestamp_ns);
-        self.match_over_time(&odometer, &predicted);
+        if let Err(e) = self.match_over_time(&odometer, &predicted) {
+            self.odometer = Some(odometer);
+            return Err(e);
+        }
         let matched = Instant::now();
         let measured = self.measure_motion(&odometer, &predicted);
         let counts = self.counts(measured.as_ref());
@@ -127,11 +136,12 @@ impl Method {
             None => odometer.bridge(stamp, counts),
         };
         self.finish(odometer, row.status != Status::Lost, started, matched);
-        row
+        Ok(row)
     }
 
     /// Takes note of a pair that could not be used at all.
     pub fn skip(&mut self, stamp: PairStamp) -> Odometry {
+        self.times = StageTimes::default();
         match &mut self.odometer {
             Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
             Some(odometer) => odometer.begin(stamp, Counts::default()),
@@ -139,16 +149,17 @@ impl Method {
         }
     }
 
-    /// How long the stages of the last [`step`](Self::step) took.
+    /// How long the stages of the last [`step`](Self::step) took; zero after a
+    /// [`skip`](Self::skip).
     #[must_use]
     pub fn times(&self) -> StageTimes {
         self.times
     }
 
-    fn match_left_and_right(&mut self) {
+    fn match_left_and_right(&mut self) -> Result<(), MatchError> {
         let seen = &mut self.now;
         self.stereo_matcher
-            .find(&seen.pair.left, &seen.pair.right, &mut seen.matches);
+            .find(&seen.pair.left, &seen.pair.right, &mut seen.matches)
     }
 
     fn triangulate(&mut self) {
@@ -170,18 +181,26 @@ impl Method {
 
     /// Tracks from the reference to now: first near the prediction, then, if that finds too few,
     /// far around where things were.
-    fn match_over_time(&mut self, odometer: &Odometer, predicted: &Isometry3<f64>) {
+    fn match_over_time(
+        &mut self,
+        odometer: &Odometer,
+        predicted: &Isometry3<f64>,
+    ) -> Result<(), MatchError> {
         let wide_px = self.matching.wide_search * f64::from(self.rig.left.width);
         if odometer.has_velocity() {
-            self.find_tracks(predicted, self.matching.search_radius_px);
+            self.find_tracks(predicted, self.matching.search_radius_px)?;
             if self.tracks.len() >= self.estimation.good_inliers as usize {
-                return;
+                return Ok(());
             }
         }
-        self.find_tracks(predicted, wide_px);
+        self.find_tracks(predicted, wide_px)
     }
 
-    fn find_tracks(&mut self, reference_from_now: &Isometry3<f64>, radius_px: f64) {
+    fn find_tracks(
+        &mut self,
+        reference_from_now: &Isometry3<f64>,
+        radius_px: f64,
+    ) -> Result<(), MatchError> {
         let now_from_reference = reference_from_now.inverse();
         self.predicted.clear();
         self.predicted.extend(
@@ -196,7 +215,7 @@ impl Method {
             &self.predicted,
             radius_px,
             &mut self.tracks,
-        );
+        )
     }
 
     fn measure_motion(
@@ -295,5 +314,48 @@ impl From<&StereoPair> for DescribedPair {
             timestamp_ns: pair.timestamp_ns,
             ..Self::default()
         }
+    }
+}
+
+#[cfg(all(test, feature = "opencv"))]
+mod tests {
+    use super::*;
+    use crate::matching::MatcherName;
+    use crate::matching::synthetic::{Scene, View, rig};
+
+    fn described(sequence: u64, [left, right]: &[View; 2]) -> DescribedPair {
+        DescribedPair {
+            sequence,
+            timestamp_ns: 100_000_000 * sequence as i64,
+            left: left.features.clone(),
+            right: right.features.clone(),
+        }
+    }
+
+    /// A pair that cannot be matched leaves no trace but that it was skipped.
+    #[test]
+    fn a_pair_that_flann_refuses_is_as_good_as_skipped() {
+        let scene = Scene::new(1, 200, 100);
+        let flann = matching::Settings {
+            matcher: MatcherName::Flann,
+            ..matching::Settings::default()
+        };
+        let mut unlike = described(1, &scene.before);
+        unlike.right.descriptor_len = 32;
+        let run = |spoilt: bool| {
+            let mut method = Method::new(rig(), flann.clone(), estimation::Settings::default())
+                .expect("has a baseline");
+            let first = method.step(&mut described(0, &scene.before));
+            if spoilt {
+                assert!(method.step(&mut unlike.clone()).is_err());
+            }
+            let skipped = method.skip(unlike.stamp());
+            let last = method.step(&mut described(2, &scene.now));
+            [first, Ok(skipped), last].map(|row| row.expect("matched"))
+        };
+        let rows = run(true);
+        assert_eq!(rows[2].status, Status::Tracking);
+        assert_eq!(rows[2].counts.tracks, 200);
+        assert_eq!(format!("{rows:?}"), format!("{:?}", run(false)));
     }
 }

@@ -23,12 +23,12 @@ mod publication;
 mod python_client;
 #[cfg(test)]
 mod recordings;
+#[cfg(test)]
 mod replay;
 #[cfg(test)]
 #[cfg(feature = "ipc")]
 mod replay_publication;
 #[cfg(test)]
 mod report;
-#[cfg(test)]
 #[cfg(test)]
 mod samples;

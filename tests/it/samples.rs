@@ -72,7 +72,8 @@ fn the_sample_configuration_is_the_default() {
 fn the_sample_configuration_has_every_key_and_no_other() {
     let in_force = keys(&sample_text().parse().unwrap());
     let defaults = keys(&toml::Table::try_from(Config::default()).unwrap());
-    let is_opencv = |key: &&String| key.starts_with("features.opencv.");
+    let is_opencv =
+        |key: &&String| key.starts_with("features.opencv.") || key.starts_with("matching.flann.");
     let without_opencv = |keys: &BTreeSet<String>| -> BTreeSet<String> {
         keys.iter().filter(|key| !is_opencv(key)).cloned().collect()
     };
@@ -92,6 +93,7 @@ fn the_sample_configuration_has_every_key_and_no_other() {
 fn commented_settings_of_opencv_are_the_default() {
     let config = Config::parse(&uncommented(&sample_text())).unwrap();
     assert_eq!(config.features, Config::default().features);
+    assert_eq!(config.matching, Config::default().matching);
 }
 
 #[test]
