@@ -3,6 +3,8 @@
 mod demo;
 mod evaluate;
 mod features;
+#[cfg(feature = "ipc")]
+mod health;
 mod listen;
 mod progress;
 mod replay;

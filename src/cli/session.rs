@@ -1,5 +1,7 @@
 //! What a run of the pipeline writes and publishes, for every command that runs it.
 
+#[cfg(feature = "ipc")]
+use super::health::Health;
 use super::{Failure, progress};
 use crate::capture::PairSource;
 use crate::config::Config;
@@ -29,6 +31,8 @@ pub(crate) struct Session {
     rows: Option<Vec<OdometryRow>>,
     #[cfg(feature = "ipc")]
     publisher: Option<Publisher>,
+    #[cfg(feature = "ipc")]
+    health: Health,
     published: u64,
     publish_failures: u64,
     each_row: Option<RowWatcher>,
@@ -71,6 +75,8 @@ impl Session {
             rows: None,
             #[cfg(feature = "ipc")]
             publisher: None,
+            #[cfg(feature = "ipc")]
+            health: Health::default(),
             published: 0,
             publish_failures: 0,
             each_row: None,
@@ -217,6 +223,14 @@ impl Session {
                     eprintln!("visod: warning: {e}");
                 }
             }
+        }
+        self.health.add(delivery);
+        if self.health.is_due() {
+            let message = self
+                .health
+                .message(publisher.subscribers(), self.publish_failures);
+            // Health is repeated every second: one that fails is not missed.
+            let _ = publisher.publish_health(&message);
         }
     }
 

@@ -417,7 +417,8 @@ fn check_unit(field: &'static str, xyzw: &[f64; 4]) -> Result<(), MessageError> 
     })
 }
 
-fn status_code(status: Status) -> u32 {
+/// The code of a status in messages.
+pub(crate) fn status_code(status: Status) -> u32 {
     match status {
         Status::Initializing => 0,
         Status::Tracking => 1,

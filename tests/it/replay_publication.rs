@@ -5,21 +5,30 @@ use super::publication::{PATIENCE, System};
 use super::replay::{PAIRS, Recording, Replayed, replay, stderr_of};
 use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
 use serde_json::Value;
-use std::path::Path;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 use visod::geometry::{load_rig, rig_to_toml};
+use visod::output::health::CameraState;
 use visod::output::publisher::Publisher;
+use visod::output::subscriber::HealthSubscriber;
 
-/// Replays a recording in an iceoryx2 of its own, to a listener that was there first.
-fn heard(recording: &Path, pairs: u64) -> (Replayed, Vec<String>) {
-    let system = System::new();
-    let folder = tempfile::tempdir().unwrap();
-    let config = folder.path().join("visod.toml");
+/// A configuration that publishes in `system`.
+fn config_for(system: &System, folder: &Path) -> PathBuf {
+    let config = folder.join("visod.toml");
     let publish = format!(
         "[publish]\nroot = \"{}\"\nprefix = \"{}\"\n",
         system.root(),
         system.prefix()
     );
     std::fs::write(&config, publish).unwrap();
+    config
+}
+
+/// Replays a recording in an iceoryx2 of its own, to a listener that was there first.
+fn heard(recording: &Path, pairs: u64) -> (Replayed, Vec<String>) {
+    let system = System::new();
+    let folder = tempfile::tempdir().unwrap();
+    let config = config_for(&system, folder.path());
     let listener = system.listen(&["--json", "--count", &pairs.to_string(), "--timeout", "60"]);
     // Another publisher, which leaves before the replay comes, tells when the listener is there.
     let publisher = Publisher::new(&system.settings).unwrap();
@@ -110,4 +119,42 @@ fn with_a_mounting_the_pose_of_the_base_is_published() {
     // The file keeps the camera's pose.
     let plain = super::replay::replay_quietly(recording.path(), &[]);
     assert!(run.csv == plain.csv);
+}
+
+#[test]
+fn health_is_published_with_every_change_of_status() {
+    let system = System::new();
+    let folder = tempfile::tempdir().unwrap();
+    let config = config_for(&system, folder.path());
+    let mut health = HealthSubscriber::new("health test", &system.settings).unwrap();
+    let recording = Recording::shared();
+    let mut heard = Vec::new();
+    let run = std::thread::scope(|scope| {
+        let replaying =
+            scope.spawn(|| replay(recording.path(), &["--config", config.to_str().unwrap()]));
+        // A subscriber connects as it receives, so it must do so while the replay runs.
+        while !replaying.is_finished() {
+            health.wait(Duration::from_millis(100)).unwrap();
+            while let Some(received) = health.receive().unwrap() {
+                received.message.validate().unwrap();
+                heard.push(received.message);
+            }
+        }
+        replaying.join().unwrap()
+    });
+    // The first pair initializes, the second tracks: two changes at least.
+    assert!(heard.len() >= 2, "{heard:?}");
+    assert_eq!(heard[0].odometry_status, 0);
+    assert_eq!(heard[1].odometry_status, 1);
+    for (n, message) in heard.iter().enumerate() {
+        assert_eq!(message.left_state, CameraState::Streaming as u32);
+        assert!(message.pairs_processed > n as u64);
+        assert!(message.pairs_processed <= PAIRS);
+        assert_eq!(
+            message.left_frames + message.pairs_unusable,
+            message.pairs_processed
+        );
+        assert_eq!(message.subscribers, 0, "odometry had none");
+    }
+    assert_eq!(run.summary["published"].as_u64(), Some(PAIRS));
 }

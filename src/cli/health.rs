@@ -1,0 +1,67 @@
+//! The state of a run, as `visod/health` tells it.
+
+use crate::estimation::Status;
+use crate::output::health::{CameraState, HealthMessage};
+use crate::output::message::status_code;
+use crate::pipeline::Delivery;
+use std::time::{Duration, Instant};
+
+/// How often health is published, at least.
+const HEALTH_PERIOD: Duration = Duration::from_secs(1);
+
+/// The state that goes to `visod/health`: every second, and whenever the status changes.
+#[derive(Default)]
+pub(crate) struct Health {
+    message: HealthMessage,
+    status: Option<Status>,
+    changed: bool,
+    published: Option<Instant>,
+    busy_total: Duration,
+}
+
+impl Health {
+    /// Takes note of a pair. A recording's cameras stream as long as it has images.
+    pub(crate) fn add(&mut self, delivery: &Delivery<'_>) {
+        let odometry = delivery.odometry;
+        let took = &delivery.latencies;
+        let busy = took.features + took.matching + took.estimation;
+        self.changed |= self.status != Some(odometry.status);
+        self.status = Some(odometry.status);
+        self.busy_total += busy;
+        let ns = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
+        let m = &mut self.message;
+        m.odometry_status = status_code(odometry.status);
+        m.pairs_processed += 1;
+        m.left_state = CameraState::Streaming as u32;
+        m.right_state = CameraState::Streaming as u32;
+        if delivery.unusable.is_some() {
+            m.pairs_unusable += 1;
+        } else {
+            m.left_frames += 1;
+            m.right_frames += 1;
+        }
+        m.pairs_lost += u64::from(odometry.status == Status::Lost);
+        m.pairs_degraded += u64::from(odometry.status == Status::Degraded);
+        m.busy_max_ns = m.busy_max_ns.max(ns(busy));
+        m.busy_mean_ns = ns(self.busy_total) / m.pairs_processed;
+    }
+
+    /// The message, with what the publisher knows.
+    pub(crate) fn message(&self, subscribers: usize, publish_failures: u64) -> HealthMessage {
+        HealthMessage {
+            subscribers: subscribers as u64,
+            publish_failures,
+            ..self.message
+        }
+    }
+
+    /// Whether it is time to publish; if so, the time counts from now.
+    pub(crate) fn is_due(&mut self) -> bool {
+        let due = self.changed || self.published.is_none_or(|t| t.elapsed() >= HEALTH_PERIOD);
+        if due {
+            self.changed = false;
+            self.published = Some(Instant::now());
+        }
+        due
+    }
+}
