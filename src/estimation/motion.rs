@@ -51,7 +51,7 @@ pub fn measure(
         return None;
     }
     match settings.method {
-        Method::Svd => closed_form_motion(rig, &inliers),
+        Method::Svd => closed_form_motion(rig, &inliers, settings),
         Method::Bundle => {
             let adjusted = adjust_and_judge(
                 rig,
@@ -99,15 +99,23 @@ fn adjust_and_judge(
 
 /// The thesis' estimator: closed form on triangulated points, its covariance scaled by the residuals
 /// in the image.
-fn closed_form_motion(rig: &StereoRig, inliers: &[TrackedPoint]) -> Option<MeasuredMotion> {
+fn closed_form_motion(
+    rig: &StereoRig,
+    inliers: &[TrackedPoint],
+    settings: &Settings,
+) -> Option<MeasuredMotion> {
     let landmarks: Vec<(Landmark, Landmark)> = inliers
         .iter()
         .filter_map(|p| {
             let prev = super::triangulate(rig, &p.prev)?;
             let now = super::triangulate(rig, &p.now)?;
-            Some((prev, now))
+            // One distant point, metres off along its ray, would lead the unweighted fit.
+            (prev.is_first_order() && now.is_first_order()).then_some((prev, now))
         })
         .collect();
+    if landmarks.len() < settings.min_inliers as usize {
+        return None;
+    }
     let mut estimate = closed_form::align_with_covariance(landmarks.iter().copied())?;
     let variance_factor = cloud_variance_factor(&landmarks, &estimate.prev_from_now)?;
     estimate.cov_right *= variance_factor;

@@ -39,7 +39,8 @@ pub struct Settings {
     /// loses good matches without catching more bad ones.
     pub max_ratio: f32,
     /// Greatest descriptor distance of a match. No unit (descriptors have length 1), 0 to 2,
-    /// default 0.6.
+    /// default 1: what is farther apart is hardly nearer than chance (√2); a quarter of the bits of
+    /// a binary descriptor.
     pub max_distance: f32,
     /// How far a right feature's rectified row may lie from the left one's. px, 0.1 to 50, default
     /// 2: three σ of fine features and what a good calibration leaves.
@@ -73,7 +74,7 @@ impl Default for Settings {
         Self {
             matcher: MatcherName::default(),
             max_ratio: 0.85,
-            max_distance: 0.6,
+            max_distance: 1.0,
             row_band_px: 2.0,
             row_band_sigmas: 3.0,
             min_disparity_px: -1.0,
