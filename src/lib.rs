@@ -7,6 +7,7 @@
 //! | [`capture`] | cameras, recordings | [`capture::StereoPair`] |
 //! | [`features`] | one image | [`features::Features`] |
 //! | [`matching`] | features left, right, before | matches, tracks |
+//! | [`refinement`] | tracks, images | tracks to a fraction of a pixel |
 //! | [`estimation`] | tracks | [`estimation::Odometry`] |
 //! | [`output`] | odometry | shared memory, CSV, report |
 //!
@@ -24,6 +25,7 @@ pub mod image;
 pub mod matching;
 pub mod output;
 pub mod pipeline;
+pub mod refinement;
 pub mod settings;
 pub mod simulation;
 mod toml_file;

@@ -262,7 +262,7 @@ pub fn squared_residual_sigmas(
     Some(residuals.iter().map(Vector2::norm_squared).sum())
 }
 
-fn huber_weight(sigmas: f64) -> f64 {
+pub(super) fn huber_weight(sigmas: f64) -> f64 {
     if sigmas <= HUBER_SIGMAS {
         1.0
     } else {
@@ -270,7 +270,7 @@ fn huber_weight(sigmas: f64) -> f64 {
     }
 }
 
-fn huber_loss(sigmas: f64) -> f64 {
+pub(super) fn huber_loss(sigmas: f64) -> f64 {
     if sigmas <= HUBER_SIGMAS {
         0.5 * sigmas * sigmas
     } else {

@@ -6,7 +6,7 @@
 //! error's distribution and spoil the covariance).
 
 use super::bundle::TrackedPoint;
-use super::{closed_form, sight};
+use super::{StereoMeasurement, closed_form, sight};
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix6, Point3, Vector3, Vector4, Vector6};
 use rand::{RngExt, SeedableRng};
@@ -45,13 +45,40 @@ const SAMPLE_SLACK: f64 = 4.0;
 const SAMPLE_STEPS: usize = 3;
 const FINAL_ROUNDS: usize = 3;
 
+/// A point that is known with some uncertainty, and where it is seen now.
+#[derive(Clone, Copy, Debug)]
+pub struct Sighting {
+    /// (x, y, ρ) in the left camera before.
+    pub inverse_depth: Vector3<f64>,
+    /// Its covariance.
+    pub cov: Matrix3<f64>,
+    /// Where it is seen now.
+    pub now: StereoMeasurement,
+}
+
+impl Sighting {
+    /// The sighting of a track whose point is known from the earlier pair alone. `None` where that
+    /// does not determine it.
+    #[must_use]
+    pub fn of(rig: &StereoRig, p: &TrackedPoint) -> Option<Self> {
+        let identity = Isometry3::identity();
+        let by_point = sight::linearise(rig, &identity, &p.inverse_depth)?.by_point;
+        let info = Matrix4::from_diagonal(&p.prev.sigma_px.map(|s| 1.0 / (s * s)));
+        Some(Self {
+            inverse_depth: p.inverse_depth,
+            cov: (by_point.transpose() * info * by_point).cholesky()?.inverse(),
+            now: p.now,
+        })
+    }
+}
+
 /// Finds the consensus of `points`. `guess`, where there is one, is tried before any sample.
 ///
 /// `None` if fewer than three tracks agree on anything.
 #[must_use]
 pub fn find(
     rig: &StereoRig,
-    points: &[TrackedPoint],
+    points: &[Sighting],
     guess: Option<&Isometry3<f64>>,
     search: &Search,
 ) -> Option<Consensus> {
@@ -120,7 +147,7 @@ struct Candidate {
 }
 
 impl Candidate {
-    fn new(rig: &StereoRig, p: &TrackedPoint, guess: Option<&Isometry3<f64>>) -> Self {
+    fn new(rig: &StereoRig, p: &Sighting, guess: Option<&Isometry3<f64>>) -> Self {
         let now_from_prev = guess.map_or_else(Isometry3::identity, Isometry3::inverse);
         let info = Self::predicted_info(rig, p, &now_from_prev).unwrap_or_else(|| {
             let var = p.now.sigma_px.component_mul(&p.now.sigma_px) * 4.0;
@@ -139,20 +166,14 @@ impl Candidate {
         }
     }
 
-    /// Residual now = its own noise plus what the earlier measurement's point carries over.
+    /// Residual now = its own noise plus what the uncertainty of the point carries over.
     fn predicted_info(
         rig: &StereoRig,
-        p: &TrackedPoint,
+        p: &Sighting,
         now_from_prev: &Isometry3<f64>,
     ) -> Option<Matrix4<f64>> {
-        let identity = Isometry3::identity();
-        let prev_by_point = sight::linearise(rig, &identity, &p.inverse_depth)?.by_point;
-        let prev_info = p.prev.sigma_px.map(|s| 1.0 / (s * s));
-        let hessian =
-            prev_by_point.transpose() * Matrix4::from_diagonal(&prev_info) * prev_by_point;
-        let cov_point: Matrix3<f64> = hessian.cholesky()?.inverse();
-        let now_by_point = sight::linearise(rig, now_from_prev, &p.inverse_depth)?.by_point;
-        let cov = p.now.cov_px2() + now_by_point * cov_point * now_by_point.transpose();
+        let by_point = sight::linearise(rig, now_from_prev, &p.inverse_depth)?.by_point;
+        let cov = p.now.cov_px2() + by_point * p.cov * by_point.transpose();
         Some(cov.cholesky()?.inverse())
     }
 

@@ -8,11 +8,12 @@ mod odometer;
 mod settings;
 mod sight;
 mod triangulation;
+pub mod window;
 
 pub use motion::{MeasuredMotion, measure};
 pub use odometer::{Odometer, PairStamp};
 pub use settings::{Method, Settings};
-pub use sight::{inverse_depth, seen_at};
+pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
 
 use nalgebra::{Isometry3, Matrix6, Vector6};

@@ -2,7 +2,7 @@
 
 use super::bundle::{self, Adjuster, TrackedPoint};
 use super::closed_form::{self, MotionEstimate};
-use super::consensus::{self, Search};
+use super::consensus::{self, Search, Sighting};
 use super::{Landmark, Method, Settings};
 use crate::geometry::StereoRig;
 use nalgebra::{Isometry3, Point3, Vector3};
@@ -41,18 +41,22 @@ pub fn measure(
         variance_factor,
         seed,
     };
-    let consensus = consensus::find(rig, points, guess, &search)?;
+    let (kept, sightings): (Vec<u32>, Vec<Sighting>) = (0..)
+        .zip(points)
+        .filter_map(|(i, p)| Some((i, Sighting::of(rig, p)?)))
+        .unzip();
+    let consensus = consensus::find(rig, &sightings, guess, &search)?;
     let mut inliers: Vec<TrackedPoint> = consensus
         .inliers
         .iter()
-        .map(|&i| points[i as usize])
+        .map(|&i| points[kept[i as usize] as usize])
         .collect();
     if inliers.len() < settings.min_inliers as usize {
         return None;
     }
     match settings.method {
         Method::Svd => closed_form_motion(rig, &inliers, settings),
-        Method::Bundle => {
+        Method::Bundle | Method::Window => {
             let adjusted = adjust_and_judge(
                 rig,
                 &consensus.prev_from_now,

@@ -6,6 +6,7 @@
 //! bridge is forgotten.
 
 use super::closed_form::MotionEstimate;
+use super::window::Tracked;
 use super::{Counts, ErrorBudget, MeasuredMotion, Odometry, Settings, Status};
 use crate::geometry::se3;
 use crate::uncertainty::compounding;
@@ -138,6 +139,17 @@ impl Odometer {
             detection: compounding::chain(&self.reference.detection, &reference_from_now, &cov),
             bridging: compounding::carry(&self.reference.bridging, &reference_from_now),
         };
+        self.go_on(stamp, now, measured, counts)
+    }
+
+    /// Makes `now` the reference and the last row.
+    fn go_on(
+        &mut self,
+        stamp: PairStamp,
+        now: Place,
+        measured: &MeasuredMotion,
+        counts: Counts,
+    ) -> Odometry {
         let since_last = self.since_last_row(&measured.estimate);
         let dt_s = seconds_between(self.last.timestamp_ns, stamp.timestamp_ns);
         self.velocity = velocity_of(&since_last, dt_s);
@@ -153,6 +165,28 @@ impl Odometer {
             Status::Degraded
         };
         self.row(stamp, status, &since_last, counts, measured.variance_factor)
+    }
+
+    /// The row of a pair whose pose the window knows; the pair becomes the reference.
+    pub fn arrive(&mut self, stamp: PairStamp, tracked: &Tracked, counts: Counts) -> Odometry {
+        let place = Place {
+            odom_from_camera: tracked.odom_from_now,
+            timestamp_ns: stamp.timestamp_ns,
+            detection: tracked.cov_pose_right,
+            bridging: compounding::carry(&self.reference.bridging, &tracked.motion.prev_from_now),
+        };
+        let measured = MeasuredMotion {
+            estimate: tracked.motion,
+            variance_factor: tracked.variance_factor,
+            inliers: tracked.inliers,
+        };
+        self.go_on(stamp, place, &measured, counts)
+    }
+
+    /// Where the last row stands, and how sure that is (right perturbation), bridges left out.
+    #[must_use]
+    pub fn last_place(&self) -> (Isometry3<f64>, Matrix6<f64>) {
+        (self.last.odom_from_camera, self.last.detection)
     }
 
     /// The row of a pair whose motion could not be measured: the pose goes on with the last

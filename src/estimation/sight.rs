@@ -10,13 +10,14 @@ use crate::geometry::{StereoRig, so3};
 use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix4x3, Point3, SMatrix, Vector3, Vector4};
 
 /// A sight, linearised.
-pub(super) struct Sight {
+#[derive(Clone, Copy, Debug)]
+pub struct Sight {
     /// (ul, vl, ur, vr), px.
-    pub(super) px: Vector4<f64>,
+    pub px: Vector4<f64>,
     /// By (x, y, ρ).
-    pub(super) by_point: Matrix4x3<f64>,
+    pub by_point: Matrix4x3<f64>,
     /// By a right perturbation of `prev_from_now` (translation, rotation).
-    pub(super) by_motion: SMatrix<f64, 4, 6>,
+    pub by_motion: SMatrix<f64, 4, 6>,
 }
 
 /// Where the rig, moved by `now_from_prev`, sees the point `y` = (x, y, ρ): (ul, vl, ur, vr), px.
@@ -36,7 +37,8 @@ pub fn seen_at(
 }
 
 /// [`seen_at`] with its derivatives.
-pub(super) fn linearise(
+#[must_use]
+pub fn linearise(
     rig: &StereoRig,
     now_from_prev: &Isometry3<f64>,
     y: &Vector3<f64>,

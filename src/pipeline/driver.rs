@@ -9,10 +9,10 @@
 //! and what is in them does not depend on how many workers there are. A fixed number of pairs is
 //! under way at once: their buffers go round, so that nothing is allocated after the first few.
 
-use super::method::{DescribedPair, Method};
+use super::method::{Described, DescribedPair, Method};
 use crate::capture::{PairEvent, PairSource, Side, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
-use crate::features::{Extractor, Features};
+use crate::features::Extractor;
 use crate::image::GrayImage;
 use crate::settings::SettingError;
 use crossbeam_channel::{Receiver, Sender, bounded};
@@ -133,8 +133,8 @@ pub fn run<S: PairSource, E>(
 #[derive(Default)]
 struct Spare {
     used: Option<StereoPair>,
-    left: Features,
-    right: Features,
+    left: Described,
+    right: Described,
 }
 
 /// One image to find features in.
@@ -144,7 +144,7 @@ struct Job {
     arrived: Instant,
     side: Side,
     image: GrayImage,
-    features: Features,
+    described: Described,
 }
 
 /// What comes back: tickets count the source's events.
@@ -189,13 +189,13 @@ fn feed<S: PairSource>(
                     sequence: pair.sequence,
                     timestamp_ns: pair.timestamp_ns,
                 };
-                let job = |side, image, features| Job {
+                let job = |side, image, described| Job {
                     ticket,
                     stamp,
                     arrived,
                     side,
                     image,
-                    features,
+                    described,
                 };
                 let left = job(Side::Left, pair.left, buffers.left);
                 let right = job(Side::Right, pair.right, buffers.right);
@@ -223,7 +223,8 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
     let _alarm = Alarm(done);
     while let Ok(mut job) = jobs.recv() {
         let started = Instant::now();
-        let result = extractor.extract(&job.image, &mut job.features);
+        let result = extractor.extract(&job.image, &mut job.described.features);
+        job.described.pyramid.fill(&job.image);
         let side = Done::Side {
             took: started.elapsed(),
             failed: result.err().map(|e| e.to_string()),
@@ -347,8 +348,8 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
             *described = DescribedPair {
                 sequence: stamp.sequence,
                 timestamp_ns: stamp.timestamp_ns,
-                left: left.job.features,
-                right: right.job.features,
+                left: left.job.described,
+                right: right.job.described,
             };
             let stepped = match left.failed.or(right.failed) {
                 Some(why) => Err(why),

@@ -1,20 +1,32 @@
 //! The method: one stereo pair after the other in, one odometry row each out.
 //!
 //! [`Method::step`] is the whole of it. Features are extracted before, for that may be done for
-//! several images at once; everything else depends on the pair before and is done in order.
+//! several images at once; everything else depends on the pair before and is done in order: by the
+//! window of keyframes ([`super::windowed`]), or from pair to pair ([`super::two_frame`]).
 
+use super::two_frame::TwoFrame;
+use super::windowed::Windowed;
 use crate::capture::StereoPair;
 use crate::estimation::{
-    self, Counts, MeasuredMotion, Odometer, Odometry, PairStamp, Status, StereoMeasurement,
-    bundle::{Adjuster, TrackedPoint},
+    self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement,
 };
 use crate::features::Features;
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
 };
-use nalgebra::{Isometry3, Vector3, Vector4};
+use crate::refinement::{Pyramid, PyramidPair};
+use nalgebra::{Vector3, Vector4};
 use std::time::{Duration, Instant};
+
+/// What is known of one image.
+#[derive(Clone, Debug, Default)]
+pub struct Described {
+    /// Its features.
+    pub features: Features,
+    /// Its reductions.
+    pub pyramid: Pyramid,
+}
 
 /// A pair with the features of both its images.
 #[derive(Clone, Debug, Default)]
@@ -23,17 +35,24 @@ pub struct DescribedPair {
     pub sequence: u64,
     /// When the left image was taken, ns.
     pub timestamp_ns: i64,
-    /// The left image's features.
-    pub left: Features,
-    /// The right image's features.
-    pub right: Features,
+    /// The left image's.
+    pub left: Described,
+    /// The right image's.
+    pub right: Described,
 }
 
 impl DescribedPair {
-    fn stamp(&self) -> PairStamp {
+    pub(super) fn stamp(&self) -> PairStamp {
         PairStamp {
             sequence: self.sequence,
             timestamp_ns: self.timestamp_ns,
+        }
+    }
+
+    pub(super) fn pyramids(&self) -> PyramidPair<'_> {
+        PyramidPair {
+            left: &self.left.pyramid,
+            right: &self.right.pyramid,
         }
     }
 }
@@ -49,28 +68,38 @@ pub struct StageTimes {
 
 /// A pair's features with its stereo matches and where their points are.
 #[derive(Debug, Default)]
-struct Seen {
-    pair: DescribedPair,
-    matches: Vec<StereoMatch>,
-    measurements: Vec<StereoMeasurement>,
+pub(super) struct Seen {
+    pub(super) pair: DescribedPair,
+    pub(super) matches: Vec<StereoMatch>,
+    pub(super) measurements: Vec<StereoMeasurement>,
     /// (x, y, ρ) in the left camera; `None` where the sights do not meet.
-    inverse_depths: Vec<Option<Vector3<f64>>>,
+    pub(super) inverse_depths: Vec<Option<Vector3<f64>>>,
+}
+
+/// What both estimators work with: the present pair, the matchers, the settings.
+pub(super) struct Workbench {
+    pub(super) rig: StereoRig,
+    pub(super) matching: matching::Settings,
+    pub(super) estimation: estimation::Settings,
+    stereo_matcher: StereoMatcher,
+    pub(super) temporal_matcher: TemporalMatcher,
+    pub(super) now: Seen,
+    pub(super) predicted: Vec<Option<Vector4<f64>>>,
+    pub(super) tracks: Vec<Track>,
+    pub(super) odometer: Option<Odometer>,
+    /// When matching was done and estimation began.
+    pub(super) matched: Option<Instant>,
+}
+
+enum Estimator {
+    TwoFrame(TwoFrame),
+    Window(Box<Windowed>),
 }
 
 /// The state between pairs.
 pub struct Method {
-    rig: StereoRig,
-    matching: matching::Settings,
-    estimation: estimation::Settings,
-    stereo_matcher: StereoMatcher,
-    temporal_matcher: TemporalMatcher,
-    odometer: Option<Odometer>,
-    reference: Seen,
-    now: Seen,
-    predicted: Vec<Option<Vector4<f64>>>,
-    tracks: Vec<Track>,
-    points: Vec<TrackedPoint>,
-    adjuster: Adjuster,
+    bench: Workbench,
+    estimator: Estimator,
     times: StageTimes,
 }
 
@@ -84,19 +113,27 @@ impl Method {
         estimation: estimation::Settings,
     ) -> Option<Self> {
         let rectification = Rectification::new(&rig)?;
-        Some(Self {
+        let estimator = match estimation.method {
+            estimation::Method::Window => {
+                Estimator::Window(Box::new(Windowed::new(&rig, &estimation)))
+            }
+            _ => Estimator::TwoFrame(TwoFrame::default()),
+        };
+        let bench = Workbench {
             rig,
             stereo_matcher: StereoMatcher::new(matching.clone(), rectification),
             temporal_matcher: TemporalMatcher::new(matching.clone()),
             matching,
             estimation,
-            odometer: None,
-            reference: Seen::default(),
             now: Seen::default(),
             predicted: Vec::new(),
             tracks: Vec::new(),
-            points: Vec::new(),
-            adjuster: Adjuster::default(),
+            odometer: None,
+            matched: None,
+        };
+        Some(Self {
+            bench,
+            estimator,
             times: StageTimes::default(),
         })
     }
@@ -107,45 +144,31 @@ impl Method {
     /// Its features could not be matched. The method stands as before the pair, which is then to be
     /// [skipped](Self::skip).
     pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, MatchError> {
-        std::mem::swap(&mut self.now.pair, pair);
-        let stamp = self.now.pair.stamp();
+        std::mem::swap(&mut self.bench.now.pair, pair);
         let started = Instant::now();
-        self.match_left_and_right()?;
-        self.triangulate();
-        let Some(mut odometer) = self.odometer.take() else {
-            let matched = Instant::now();
-            let mut odometer = Odometer::new(self.estimation.clone(), stamp);
-            let row = odometer.begin(stamp, self.counts(None));
-            self.finish(odometer, true, started, matched);
-            return Ok(row);
+        self.bench.matched = None;
+        self.bench.match_left_and_right()?;
+        self.bench.triangulate();
+        let row = match &mut self.estimator {
+            Estimator::TwoFrame(estimator) => estimator.step(&mut self.bench)?,
+            Estimator::Window(estimator) => estimator.step(&mut self.bench)?,
         };
-        let predicted = odometer.predict(stamp.timestamp_ns);
-        if let Err(e) = self.match_over_time(&odometer, &predicted) {
-            self.odometer = Some(odometer);
-            return Err(e);
-        }
-        let matched = Instant::now();
-        let measured = self.measure_motion(&odometer, &predicted);
-        let counts = self.counts(measured.as_ref());
-        let row = match &measured {
-            Some(motion) => odometer.advance(stamp, motion, counts),
-            None if !odometer.has_tracked() && self.is_better_start() => {
-                odometer.begin(stamp, counts)
-            }
-            None if odometer.should_begin_anew() => odometer.begin_anew(stamp, counts),
-            None => odometer.bridge(stamp, counts),
+        let matched = self.bench.matched.unwrap_or_else(Instant::now);
+        self.times = StageTimes {
+            matching: matched - started,
+            estimation: matched.elapsed(),
         };
-        self.finish(odometer, row.status != Status::Lost, started, matched);
         Ok(row)
     }
 
     /// Takes note of a pair that could not be used at all.
     pub fn skip(&mut self, stamp: PairStamp) -> Odometry {
         self.times = StageTimes::default();
-        match &mut self.odometer {
+        match &mut self.bench.odometer {
             Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
             Some(odometer) => odometer.begin(stamp, Counts::default()),
-            None => Odometer::new(self.estimation.clone(), stamp).begin(stamp, Counts::default()),
+            None => Odometer::new(self.bench.estimation.clone(), stamp)
+                .begin(stamp, Counts::default()),
         }
     }
 
@@ -155,11 +178,16 @@ impl Method {
     pub fn times(&self) -> StageTimes {
         self.times
     }
+}
 
+impl Workbench {
     fn match_left_and_right(&mut self) -> Result<(), MatchError> {
         let seen = &mut self.now;
-        self.stereo_matcher
-            .find(&seen.pair.left, &seen.pair.right, &mut seen.matches)
+        self.stereo_matcher.find(
+            &seen.pair.left.features,
+            &seen.pair.right.features,
+            &mut seen.matches,
+        )
     }
 
     fn triangulate(&mut self) {
@@ -179,112 +207,22 @@ impl Method {
         );
     }
 
-    /// Tracks from the reference to now: first near the prediction, then, if that finds too few,
-    /// far around where things were.
-    fn match_over_time(
-        &mut self,
-        odometer: &Odometer,
-        predicted: &Isometry3<f64>,
-    ) -> Result<(), MatchError> {
-        let wide_px = self.matching.wide_search * f64::from(self.rig.left.width);
-        if odometer.has_velocity() {
-            self.find_tracks(predicted, self.matching.search_radius_px)?;
-            if self.tracks.len() >= self.estimation.good_inliers as usize {
-                return Ok(());
-            }
-        }
-        self.find_tracks(predicted, wide_px)
-    }
-
-    fn find_tracks(
-        &mut self,
-        reference_from_now: &Isometry3<f64>,
-        radius_px: f64,
-    ) -> Result<(), MatchError> {
-        let now_from_reference = reference_from_now.inverse();
-        self.predicted.clear();
-        self.predicted.extend(
-            self.reference
-                .inverse_depths
-                .iter()
-                .map(|y| estimation::seen_at(&self.rig, &now_from_reference, &(*y)?)),
-        );
-        self.temporal_matcher.find(
-            self.reference.matched(),
-            self.now.matched(),
-            &self.predicted,
-            radius_px,
-            &mut self.tracks,
-        )
-    }
-
-    fn measure_motion(
-        &mut self,
-        odometer: &Odometer,
-        predicted: &Isometry3<f64>,
-    ) -> Option<MeasuredMotion> {
-        self.points.clear();
-        for track in &self.tracks {
-            let Some(inverse_depth) = self.reference.inverse_depths[track.before as usize] else {
-                continue;
-            };
-            self.points.push(TrackedPoint {
-                prev: self.reference.measurements[track.before as usize],
-                now: self.now.measurements[track.now as usize],
-                inverse_depth,
-            });
-        }
-        estimation::measure(
-            &self.rig,
-            &self.points,
-            Some(predicted),
-            odometer.expected_variance_factor(),
-            self.estimation.seed ^ self.now.pair.sequence,
-            &self.estimation,
-            &mut self.adjuster,
-        )
-    }
-
-    /// Whether the present pair would make a better reference than one that nothing was ever
-    /// tracked from.
-    fn is_better_start(&self) -> bool {
-        let enough = self.estimation.min_inliers as usize;
-        self.reference.matches.len() < enough || self.now.matches.len() >= enough
-    }
-
-    fn counts(&self, measured: Option<&MeasuredMotion>) -> Counts {
+    pub(super) fn counts(&self, inliers: u32) -> Counts {
         Counts {
-            keypoints_left: self.now.pair.left.len() as u32,
-            keypoints_right: self.now.pair.right.len() as u32,
+            keypoints_left: self.now.pair.left.features.len() as u32,
+            keypoints_right: self.now.pair.right.features.len() as u32,
             stereo_matches: self.now.matches.len() as u32,
             tracks: self.tracks.len() as u32,
-            inliers: measured.map_or(0, |m| m.inliers),
+            inliers,
         }
-    }
-
-    fn finish(
-        &mut self,
-        odometer: Odometer,
-        new_reference: bool,
-        started: Instant,
-        matched: Instant,
-    ) {
-        if new_reference {
-            std::mem::swap(&mut self.reference, &mut self.now);
-        }
-        self.odometer = Some(odometer);
-        self.times = StageTimes {
-            matching: matched - started,
-            estimation: matched.elapsed(),
-        };
     }
 }
 
 impl Seen {
-    fn matched(&self) -> MatchedPair<'_> {
+    pub(super) fn matched(&self) -> MatchedPair<'_> {
         MatchedPair {
-            left: &self.pair.left,
-            right: &self.pair.right,
+            left: &self.pair.left.features,
+            right: &self.pair.right.features,
             matches: &self.matches,
         }
     }
@@ -292,8 +230,8 @@ impl Seen {
 
 /// What a stereo match measured.
 fn measurement(pair: &DescribedPair, m: StereoMatch) -> StereoMeasurement {
-    let l = &pair.left.keypoints[m.left as usize];
-    let r = &pair.right.keypoints[m.right as usize];
+    let l = &pair.left.features.keypoints[m.left as usize];
+    let r = &pair.right.features.keypoints[m.right as usize];
     let (sl, sr) = (f64::from(l.sigma_px), f64::from(r.sigma_px));
     StereoMeasurement {
         px: Vector4::new(
@@ -320,6 +258,7 @@ impl From<&StereoPair> for DescribedPair {
 #[cfg(all(test, feature = "opencv"))]
 mod tests {
     use super::*;
+    use crate::estimation::Status;
     use crate::matching::MatcherName;
     use crate::matching::synthetic::{Scene, View, rig};
 
@@ -327,8 +266,14 @@ mod tests {
         DescribedPair {
             sequence,
             timestamp_ns: 100_000_000 * sequence as i64,
-            left: left.features.clone(),
-            right: right.features.clone(),
+            left: Described {
+                features: left.features.clone(),
+                ..Described::default()
+            },
+            right: Described {
+                features: right.features.clone(),
+                ..Described::default()
+            },
         }
     }
 
@@ -340,10 +285,14 @@ mod tests {
             matcher: MatcherName::Flann,
             ..matching::Settings::default()
         };
+        let two_frame = estimation::Settings {
+            method: estimation::Method::Bundle,
+            ..estimation::Settings::default()
+        };
         let mut unlike = described(1, &scene.before);
-        unlike.right.descriptor_len = 32;
+        unlike.right.features.descriptor_len = 32;
         let run = |spoilt: bool| {
-            let mut method = Method::new(rig(), flann.clone(), estimation::Settings::default())
+            let mut method = Method::new(rig(), flann.clone(), two_frame.clone())
                 .expect("has a baseline");
             let first = method.step(&mut described(0, &scene.before));
             if spoilt {

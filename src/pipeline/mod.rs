@@ -1,9 +1,12 @@
 //! Pipeline: the method itself, and the threads that carry pairs through it.
 
 mod driver;
+mod gallery;
 mod method;
 mod statistics;
+mod two_frame;
+mod windowed;
 
 pub use driver::{Delivery, PipelineError, Settings, StageLatencies, run};
-pub use method::{DescribedPair, Method, StageTimes};
+pub use method::{Described, DescribedPair, Method, StageTimes};
 pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};

@@ -1,0 +1,103 @@
+//! The datum: where the window's oldest keyframe stands in the odometry frame.
+//!
+//! Its error (right perturbation) is `δ₀ = B x + β + ε`: `x` are the window's relative poses,
+//! counted from where the prior was linearised, `ε` is independent of them and of all that is yet
+//! to come. So the past is corrected by what the window learns, and the pose's covariance has every
+//! correlation in it.
+
+use super::{Frame, Joint};
+use crate::geometry::se3;
+use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
+
+/// A pose with an error that is partly the window's.
+#[derive(Clone, Debug)]
+pub(super) struct Datum {
+    odom_from_linearised: Isometry3<f64>,
+    /// `B`, 6 rows; columns for the frames that the prior knows.
+    by_window: Matrix6xX<f64>,
+    /// `β`.
+    offset: Vector6<f64>,
+    /// Covariance of `ε`.
+    cov: Matrix6<f64>,
+}
+
+impl Datum {
+    pub(super) fn new(odom_from_datum: &Isometry3<f64>, cov: &Matrix6<f64>) -> Self {
+        Self {
+            odom_from_linearised: *odom_from_datum,
+            by_window: Matrix6xX::zeros(0),
+            offset: Vector6::zeros(),
+            cov: *cov,
+        }
+    }
+
+    /// The pose at the window's offsets `x`.
+    pub(super) fn pose(&self, x: &DVector<f64>) -> Isometry3<f64> {
+        let known = self.by_window.ncols().min(x.len());
+        let by_window: Vector6<f64> = self.by_window.columns(0, known) * x.rows(0, known);
+        let mut pose = self.odom_from_linearised * se3::exp(&(by_window + self.offset));
+        pose.rotation.renormalize();
+        pose
+    }
+
+    /// The covariance (right perturbation) of the pose of the last frame in the window, which
+    /// stands at `datum_from_last`; `cov_window` is the joint covariance of all poses but the
+    /// datum's.
+    pub(super) fn covariance_of(
+        &self,
+        datum_from_last: &Isometry3<f64>,
+        cov_window: &Joint,
+    ) -> Matrix6<f64> {
+        let n = cov_window.nrows();
+        let carry = se3::adjoint(&datum_from_last.inverse());
+        let mut by_window = Matrix6xX::zeros(n);
+        let known = self.by_window.ncols().min(n);
+        by_window
+            .columns_mut(0, known)
+            .copy_from(&(carry * self.by_window.columns(0, known)));
+        if n >= 6 {
+            let mut own = by_window.columns_mut(n - 6, 6);
+            own += Matrix6::<f64>::identity();
+        }
+        &by_window * cov_window * by_window.transpose() + carry * self.cov * carry.transpose()
+    }
+
+    /// Moves the datum on to frame 1, whose error `x₁` is given by the others' as
+    /// `x₁ = mean + by_rest · x' + η`, η with covariance `cov_first`, where
+    /// `xᵢ = x'ᵢ + moved(i) · x₁` for the frames i > 1.
+    pub(super) fn advance(
+        &mut self,
+        frames: &[Frame],
+        moved: &[Matrix6<f64>],
+        mean: &Vector6<f64>,
+        by_rest: &Matrix6xX<f64>,
+        cov_first: &Matrix6<f64>,
+    ) {
+        let linearised = *frames[1].datum_from_linearised();
+        let carry = se3::adjoint(&linearised.inverse());
+        let rest = 6 * (frames.len() - 2);
+        let known = self.by_window.ncols();
+        let old: Matrix6xX<f64> = carry * &self.by_window;
+        // By x₁, itself included, through all that moved with it.
+        let mut by_first = Matrix6::identity();
+        let mut by_window = Matrix6xX::zeros(rest);
+        if known > 0 {
+            by_first += old.fixed_columns::<6>(0);
+            for (i, along) in moved.iter().enumerate() {
+                let at = 6 * (i + 1);
+                if at < known {
+                    let block = old.fixed_columns::<6>(at).into_owned();
+                    by_first += block * along;
+                    by_window.fixed_columns_mut::<6>(6 * i).copy_from(&block);
+                }
+            }
+        }
+        by_window += by_first * by_rest;
+        self.odom_from_linearised *= linearised;
+        self.offset = by_first * mean + carry * self.offset;
+        self.cov = se3::symmetric(
+            &(by_first * cov_first * by_first.transpose() + carry * self.cov * carry.transpose()),
+        );
+        self.by_window = by_window;
+    }
+}

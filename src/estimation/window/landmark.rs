@@ -1,0 +1,106 @@
+//! A landmark: a point that stays where it is, with what saw it.
+
+use super::super::{StereoMeasurement, sight};
+use crate::geometry::StereoRig;
+use nalgebra::{Isometry3, Matrix3, Matrix4, Vector3};
+
+/// Names a landmark for as long as it is tracked; later ones are larger.
+pub type LandmarkId = u64;
+
+/// One frame's sight of a landmark.
+#[derive(Clone, Copy, Debug)]
+pub struct Observation {
+    /// The frame's serial.
+    pub serial: u64,
+    /// Where it was seen.
+    pub measurement: StereoMeasurement,
+}
+
+/// A point in inverse depth in the left camera of the keyframe that first saw it, its *anchor*.
+#[derive(Clone, Debug)]
+pub struct Landmark {
+    /// Its name.
+    pub id: LandmarkId,
+    /// The serial of its anchor.
+    pub anchor: u64,
+    /// (x, y, ρ): the point is (x, y, 1) / ρ in the anchor's left camera.
+    pub inverse_depth: Vector3<f64>,
+    /// Covariance of (x, y, ρ), the poses being given.
+    pub cov: Matrix3<f64>,
+    /// What saw it, the anchor first, in the order of time.
+    pub observations: Vec<Observation>,
+    /// Sights of it that proved to be wrong.
+    pub wrong: u32,
+}
+
+impl Landmark {
+    /// A landmark that its anchor alone has seen. `None` where the sights do not meet.
+    #[must_use]
+    pub fn new(
+        rig: &StereoRig,
+        id: LandmarkId,
+        anchor: u64,
+        measurement: StereoMeasurement,
+    ) -> Option<Self> {
+        let inverse_depth = sight::inverse_depth(rig, &measurement)?;
+        let by_point = sight::linearise(rig, &Isometry3::identity(), &inverse_depth)?.by_point;
+        let info = Matrix4::from_diagonal(&measurement.sigma_px.map(|s| 1.0 / (s * s)));
+        let cov = (by_point.transpose() * info * by_point).cholesky()?.inverse();
+        Some(Self {
+            id,
+            anchor,
+            inverse_depth,
+            cov,
+            observations: vec![Observation {
+                serial: anchor,
+                measurement,
+            }],
+            wrong: 0,
+        })
+    }
+
+    /// Takes note of one more sight.
+    pub(super) fn observe(&mut self, serial: u64, measurement: StereoMeasurement) {
+        self.observations.push(Observation {
+            serial,
+            measurement,
+        });
+    }
+
+    /// Forgets what one frame saw.
+    pub(super) fn forget(&mut self, serial: u64) {
+        self.observations.retain(|o| o.serial != serial);
+    }
+
+    /// Whether a frame saw it.
+    pub(super) fn saw(&self, serial: u64) -> bool {
+        self.observations.iter().any(|o| o.serial == serial)
+    }
+
+    /// The serial of the frame that saw it last.
+    #[must_use]
+    pub fn last_seen(&self) -> u64 {
+        self.observations.last().map_or(self.anchor, |o| o.serial)
+    }
+
+    /// The point in another frame: (x, y, ρ) there, and its covariance. `None` where it lies behind
+    /// that frame's camera.
+    #[must_use]
+    pub fn seen_from(&self, other_from_anchor: &Isometry3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+        let rotation = other_from_anchor.rotation.to_rotation_matrix();
+        let r = rotation.matrix();
+        let t = other_from_anchor.translation.vector;
+        let y = self.inverse_depth;
+        let p = r * Vector3::new(y.x, y.y, 1.0) + t * y.z;
+        if p.z <= 1e-6 {
+            return None;
+        }
+        let moved = Vector3::new(p.x, p.y, y.z) / p.z;
+        // d(p.x, p.y, ρ) − moved · dp.z, over p.z.
+        let by_p = Matrix3::from_columns(&[r.column(0).into_owned(), r.column(1).into_owned(), t]);
+        let mut numerator = by_p;
+        numerator.set_row(2, &nalgebra::RowVector3::new(0.0, 0.0, 1.0));
+        let jacobian = (numerator - moved * by_p.row(2)) / p.z;
+        Some((moved, jacobian * self.cov * jacobian.transpose()))
+    }
+}

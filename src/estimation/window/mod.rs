@@ -1,0 +1,212 @@
+//! The window: a stereo bundle adjustment over the last keyframes, one frame's measurements in, the
+//! motion and the pose with their joint covariance out.
+//!
+//! ```text
+//! keyframe 0 (datum) ─ keyframe 1 ─ … ─ keyframe n ─ [last frame] ─ current frame
+//!       │                 landmarks, each anchored in one keyframe, seen from several
+//!  odom_from_datum
+//! ```
+//!
+//! Poses are relative to the oldest keyframe, the *datum*, so that the equations never know how far
+//! the robot has come: nothing loses precision over a long way. What lies before the window is kept
+//! as a Gaussian prior on these relative poses ([`prior`]) and as the datum's own uncertainty, its
+//! correlation with the window included ([`datum`]): marginalisation is exact to first order, so no
+//! measurement counts twice and none is forgotten.
+//!
+//! Perturbations are right ones, `T ← T · Exp(x)`. Jacobians of poses that the prior knows are
+//! taken where the prior was made (first-estimate Jacobians: Huang, Mourikis, Roumeliotis 2010), so
+//! that marginalisation adds no knowledge that is not there.
+
+mod datum;
+mod keyframes;
+mod landmark;
+mod prior;
+mod solve;
+mod system;
+#[cfg(test)]
+mod tests;
+
+pub use landmark::{Landmark, LandmarkId, Observation};
+pub use solve::Consent;
+
+use super::closed_form::MotionEstimate;
+use super::{Settings, StereoMeasurement};
+use crate::geometry::{StereoRig, se3};
+use datum::Datum;
+use nalgebra::{Isometry3, Matrix6};
+use prior::Prior;
+use system::System;
+
+/// Frames in the window at most: keyframes, the last frame and the current one.
+const MAX_FRAMES: usize = 16;
+
+/// One pair of images in the window.
+#[derive(Clone, Debug)]
+struct Frame {
+    /// Counts all frames that ever were.
+    serial: u64,
+    datum_from_frame: Isometry3<f64>,
+    /// Where the prior was linearised, for a frame that it knows.
+    linearised: Option<Isometry3<f64>>,
+    is_keyframe: bool,
+    /// Landmarks seen when it became a keyframe.
+    landmarks: usize,
+}
+
+impl Frame {
+    /// Where Jacobians are taken.
+    fn datum_from_linearised(&self) -> &Isometry3<f64> {
+        self.linearised.as_ref().unwrap_or(&self.datum_from_frame)
+    }
+}
+
+/// The state of the estimator.
+#[derive(Clone, Debug)]
+pub struct Window {
+    rig: StereoRig,
+    settings: Settings,
+    datum: Datum,
+    prior: Prior,
+    frames: Vec<Frame>,
+    landmarks: Vec<Landmark>,
+    next_serial: u64,
+    variance: VarianceFactor,
+    system: System,
+}
+
+/// The a-posteriori variance factor, smoothed over frames.
+#[derive(Clone, Copy, Debug)]
+struct VarianceFactor {
+    smoothed: f64,
+    frames: u32,
+}
+
+/// Share of a new frame in the smoothed variance factor, once there are enough.
+const VARIANCE_GAIN: f64 = 0.1;
+
+impl VarianceFactor {
+    fn take(&mut self, measured: f64) {
+        self.frames = self.frames.saturating_add(1);
+        let gain = VARIANCE_GAIN.max(1.0 / f64::from(self.frames));
+        self.smoothed += gain * (measured.max(MIN_VARIANCE_FACTOR) - self.smoothed);
+    }
+}
+
+/// However small residuals are, no more than this is believed of the stated σ: half of it.
+const MIN_VARIANCE_FACTOR: f64 = 0.25;
+
+impl Window {
+    /// An empty window whose first frame stands at `odom_from_first`, known to `cov_right`.
+    #[must_use]
+    pub fn new(
+        rig: StereoRig,
+        settings: Settings,
+        odom_from_first: &Isometry3<f64>,
+        cov_right: &Matrix6<f64>,
+    ) -> Self {
+        Self {
+            rig,
+            settings,
+            datum: Datum::new(odom_from_first, cov_right),
+            prior: Prior::default(),
+            frames: Vec::with_capacity(MAX_FRAMES),
+            landmarks: Vec::new(),
+            next_serial: 0,
+            variance: VarianceFactor {
+                smoothed: 1.0,
+                frames: 0,
+            },
+            system: System::default(),
+        }
+    }
+
+    /// The landmarks, with rising ids.
+    #[must_use]
+    pub fn landmarks(&self) -> &[Landmark] {
+        &self.landmarks
+    }
+
+    /// The landmark of this id.
+    #[must_use]
+    pub fn landmark(&self, id: LandmarkId) -> Option<&Landmark> {
+        let at = self.landmarks.binary_search_by_key(&id, |l| l.id).ok()?;
+        Some(&self.landmarks[at])
+    }
+
+    /// The variance factor to expect of measurements.
+    #[must_use]
+    pub fn variance_factor(&self) -> f64 {
+        self.variance.smoothed
+    }
+
+    /// Pose of the newest frame in the odometry frame.
+    #[must_use]
+    pub fn odom_from_newest(&self) -> Isometry3<f64> {
+        let x = self.prior.offsets(&self.frames);
+        let newest = self.frames.last().map_or_else(Isometry3::identity, |f| f.datum_from_frame);
+        self.datum.pose(&x) * newest
+    }
+
+    /// Maps a point of the newest frame's left camera into that of the frame with this serial;
+    /// `None` if the window does not hold it any more.
+    #[must_use]
+    pub fn frame_from_newest(&self, serial: u64) -> Option<Isometry3<f64>> {
+        let newest = self.frames.last()?;
+        let frame = self.frames.iter().find(|f| f.serial == serial)?;
+        Some(frame.datum_from_frame.inverse() * newest.datum_from_frame)
+    }
+
+    /// Maps a point of a landmark's anchor into the newest frame.
+    #[must_use]
+    pub fn newest_from_anchor(&self, landmark: &Landmark) -> Option<Isometry3<f64>> {
+        let newest = self.frames.last()?;
+        let anchor = &self.frames[self.frame_index(landmark.anchor)?];
+        Some(newest.datum_from_frame.inverse() * anchor.datum_from_frame)
+    }
+
+    /// The serial of the newest frame.
+    #[must_use]
+    pub fn newest_serial(&self) -> Option<u64> {
+        self.frames.last().map(|f| f.serial)
+    }
+
+    /// The serials of the keyframes, oldest first.
+    pub fn keyframe_serials(&self) -> impl Iterator<Item = u64> + '_ {
+        self.frames.iter().filter(|f| f.is_keyframe).map(|f| f.serial)
+    }
+
+    fn frame_index(&self, serial: u64) -> Option<usize> {
+        self.frames.iter().position(|f| f.serial == serial)
+    }
+
+    fn pose_covariance(&self, newest: &Isometry3<f64>, cov_window: &Joint) -> Matrix6<f64> {
+        se3::symmetric(&self.datum.covariance_of(newest, cov_window))
+    }
+}
+
+/// The joint covariance of the window's poses but the datum, six rows each.
+type Joint = nalgebra::DMatrix<f64>;
+
+/// What one frame came to.
+#[derive(Clone, Copy, Debug)]
+pub struct Tracked {
+    /// Pose of the frame in the odometry frame.
+    pub odom_from_now: Isometry3<f64>,
+    /// Its covariance, right perturbation.
+    pub cov_pose_right: Matrix6<f64>,
+    /// The motion since the frame before.
+    pub motion: MotionEstimate,
+    /// A-posteriori variance factor of this frame's measurements.
+    pub variance_factor: f64,
+    /// Measurements of this frame that the estimate rests on.
+    pub inliers: u32,
+}
+
+/// A landmark seen in the newest frame.
+#[derive(Clone, Copy, Debug)]
+pub struct Seen {
+    /// Which.
+    pub id: LandmarkId,
+    /// Where.
+    pub measurement: StereoMeasurement,
+}

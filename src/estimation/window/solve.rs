@@ -1,0 +1,325 @@
+//! One frame more: its measurements in, the adjusted window and what it says of the frame out.
+
+use super::super::closed_form::MotionEstimate;
+use super::super::consensus::{self, Search, Sighting};
+use super::super::sight;
+use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window};
+use crate::geometry::se3;
+use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
+
+/// A frame's motion that many of its sights agree on, before adjustment.
+#[derive(Clone, Debug)]
+pub struct Consent {
+    /// Maps a point of the left camera now into that of the window's newest frame.
+    pub newest_from_now: Isometry3<f64>,
+    /// Indices of the sights that agree, ascending.
+    pub inliers: Vec<u32>,
+}
+
+/// Iterations of Levenberg and Marquardt at most.
+const MAX_ITERATIONS: usize = 12;
+/// The gain in cost, σ², that a step must promise to be worth taking: a hundredth of the σ of any
+/// pose.
+const MIN_GAIN: f64 = 1e-4;
+/// Rounds of adjusting and judging the newest frame's sights.
+const ROUNDS: usize = 3;
+
+impl Window {
+    /// Begins with a first frame, which is a keyframe without landmarks as yet.
+    pub fn begin(&mut self) {
+        let serial = self.take_serial();
+        self.frames.clear();
+        self.landmarks.clear();
+        self.frames.push(Frame {
+            serial,
+            datum_from_frame: Isometry3::identity(),
+            linearised: None,
+            is_keyframe: true,
+            landmarks: 0,
+        });
+    }
+
+    /// The motion that most of `seen`, sights of known landmarks, agree on; `guess` is where to look
+    /// first. Changes nothing. `None` if fewer agree than the settings ask for.
+    #[must_use]
+    pub fn consent(&self, seen: &[Seen], guess: &Isometry3<f64>, seed: u64) -> Option<Consent> {
+        let newest = self.frames.last()?;
+        let scale = 1.0 / self.variance.smoothed;
+        let mut indices = Vec::with_capacity(seen.len());
+        let mut sightings = Vec::with_capacity(seen.len());
+        for (i, s) in (0..).zip(seen) {
+            let sighting = self.landmark(s.id).and_then(|landmark| {
+                let anchor = &self.frames[self.frame_index(landmark.anchor)?];
+                let newest_from_anchor =
+                    newest.datum_from_frame.inverse() * anchor.datum_from_frame;
+                let (inverse_depth, cov) = landmark.seen_from(&newest_from_anchor)?;
+                Some(Sighting {
+                    inverse_depth,
+                    cov: cov * scale,
+                    now: s.measurement,
+                })
+            });
+            if let Some(sighting) = sighting {
+                indices.push(i);
+                sightings.push(sighting);
+            }
+        }
+        let search = Search {
+            max_samples: self.settings.max_samples,
+            gate: self.settings.gate_sigma2,
+            variance_factor: self.variance.smoothed,
+            seed,
+        };
+        let found = consensus::find(&self.rig, &sightings, Some(guess), &search)?;
+        (found.inliers.len() >= self.settings.min_inliers as usize).then(|| Consent {
+            newest_from_now: found.prev_from_now,
+            inliers: found.inliers.iter().map(|&i| indices[i as usize]).collect(),
+        })
+    }
+
+    /// Adds the current frame, which stands at `newest_from_now`, with its sights of landmarks.
+    pub fn add(&mut self, newest_from_now: &Isometry3<f64>, seen: &[Seen]) {
+        let newest = self.frames.last().map_or_else(Isometry3::identity, |f| f.datum_from_frame);
+        let serial = self.take_serial();
+        self.frames.push(Frame {
+            serial,
+            datum_from_frame: newest * newest_from_now,
+            linearised: None,
+            is_keyframe: false,
+            landmarks: 0,
+        });
+        for s in seen {
+            if let Ok(at) = self.landmarks.binary_search_by_key(&s.id, |l| l.id) {
+                self.landmarks[at].observe(serial, s.measurement);
+            }
+        }
+    }
+
+    /// Adjusts the whole window to all sights in it, sights of the newest frame that prove to be
+    /// wrong left out. `None` if the frame is not determined by what is left of it: it is then
+    /// taken out again.
+    pub fn adjust(&mut self) -> Option<Tracked> {
+        let tracked = self.adjust_and_judge();
+        if tracked.is_none() {
+            self.drop_newest();
+        }
+        tracked
+    }
+
+    /// Lets go of the last frame but the newest, unless it is a keyframe: its sights are forgotten,
+    /// so that a standing robot sees the same keyframes for ever.
+    pub fn settle(&mut self) {
+        let n = self.frames.len();
+        if n >= 3 && !self.frames[n - 2].is_keyframe {
+            let serial = self.frames[n - 2].serial;
+            self.frames.remove(n - 2);
+            for landmark in &mut self.landmarks {
+                landmark.forget(serial);
+            }
+        }
+    }
+
+    fn take_serial(&mut self) -> u64 {
+        let serial = self.next_serial;
+        self.next_serial += 1;
+        serial
+    }
+
+    fn drop_newest(&mut self) {
+        if let Some(frame) = self.frames.pop() {
+            for landmark in &mut self.landmarks {
+                landmark.forget(frame.serial);
+            }
+        }
+    }
+
+    fn adjust_and_judge(&mut self) -> Option<Tracked> {
+        let mut joint = self.solve()?;
+        for _ in 1..ROUNDS {
+            if self.judge_newest() == 0 {
+                break;
+            }
+            joint = self.solve()?;
+        }
+        let inliers = self.count_newest();
+        if inliers < self.settings.min_inliers {
+            return None;
+        }
+        let variance_factor = self.measure_variance()?;
+        self.variance.take(variance_factor);
+        Some(self.tracked(&joint, variance_factor, inliers))
+    }
+
+    /// Levenberg–Marquardt over poses and landmarks; the joint covariance of the poses at the
+    /// optimum.
+    fn solve(&mut self) -> Option<Joint> {
+        let variance = self.variance.smoothed;
+        let mut damping = 0.0;
+        let mut system = std::mem::take(&mut self.system);
+        let mut kept: Option<(Vec<Frame>, Vec<nalgebra::Vector3<f64>>, f64)> = None;
+        let mut result = None;
+        for _ in 0..MAX_ITERATIONS {
+            let landmarks = self.landmarks.iter().enumerate();
+            let mut cost =
+                system.build(&self.rig, &self.frames, landmarks, None, variance, damping);
+            let (mut hessian, mut gradient) = system.assemble();
+            cost += self.prior.add_to(&self.frames, &mut hessian, &mut gradient);
+            if let Some((frames, points, before)) = &kept
+                && cost > before + 1e-9 * before.abs()
+            {
+                self.frames.clone_from(frames);
+                for (landmark, point) in self.landmarks.iter_mut().zip(points) {
+                    landmark.inverse_depth = *point;
+                }
+                damping = if damping == 0.0 { 1e-4 } else { damping * 10.0 };
+                if damping > 1e3 {
+                    break;
+                }
+                kept = None;
+                continue;
+            }
+            let undamped = damping == 0.0;
+            for i in 0..hessian.nrows() {
+                hessian[(i, i)] *= 1.0 + damping;
+            }
+            let Some(cholesky) = hessian.cholesky() else {
+                break;
+            };
+            let step = cholesky.solve(&gradient);
+            if step.iter().any(|v| !v.is_finite()) {
+                break;
+            }
+            let gain = 0.5 * step.dot(&gradient);
+            if undamped && gain < MIN_GAIN {
+                // The landmarks' own covariances are still due.
+                system.move_landmarks(&DVector::zeros(step.len()), &mut self.landmarks);
+                result = Some(cholesky.inverse());
+                break;
+            }
+            kept = Some((
+                self.frames.clone(),
+                self.landmarks.iter().map(|l| l.inverse_depth).collect(),
+                cost,
+            ));
+            self.move_frames(&step);
+            system.move_landmarks(&step, &mut self.landmarks);
+            damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
+            result = Some(cholesky.inverse());
+        }
+        self.system = system;
+        result
+    }
+
+    fn move_frames(&mut self, step: &DVector<f64>) {
+        for (i, frame) in self.frames.iter_mut().enumerate().skip(1) {
+            let x: Vector6<f64> = step.fixed_rows::<6>(6 * (i - 1)).into_owned();
+            // Counted from where Jacobians are taken, so that steps add up as the prior counts them.
+            frame.datum_from_frame = match &frame.linearised {
+                Some(linearised) => {
+                    let offset = se3::log(&(linearised.inverse() * frame.datum_from_frame));
+                    linearised * se3::exp(&(offset + x))
+                }
+                None => frame.datum_from_frame * se3::exp(&x),
+            };
+            frame.datum_from_frame.rotation.renormalize();
+        }
+    }
+
+    /// Takes out the newest frame's sights that lie beyond the gate; how many.
+    fn judge_newest(&mut self) -> usize {
+        let limit = self.settings.gate_sigma2 * self.variance.smoothed;
+        let Some(newest) = self.frames.last().map(|f| f.serial) else {
+            return 0;
+        };
+        let mut wrong = 0;
+        for i in 0..self.landmarks.len() {
+            if self.landmarks[i].last_seen() != newest {
+                continue;
+            }
+            let judged = self.squared_sigmas(i, newest);
+            if judged.is_none_or(|e| e > limit) && self.landmarks[i].anchor != newest {
+                self.landmarks[i].forget(newest);
+                self.landmarks[i].wrong += 1;
+                wrong += 1;
+            }
+        }
+        wrong
+    }
+
+    /// Squared residual, σ², of a landmark as one frame saw it.
+    fn squared_sigmas(&self, landmark: usize, serial: u64) -> Option<f64> {
+        let landmark = &self.landmarks[landmark];
+        let anchor = &self.frames[self.frame_index(landmark.anchor)?];
+        let frame = &self.frames[self.frame_index(serial)?];
+        let observation = landmark.observations.iter().find(|o| o.serial == serial)?;
+        let frame_from_anchor = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
+        let seen = sight::seen_at(&self.rig, &frame_from_anchor, &landmark.inverse_depth)?;
+        let m = &observation.measurement;
+        Some((m.px - seen).component_div(&m.sigma_px).norm_squared())
+    }
+
+    fn count_newest(&self) -> u32 {
+        let newest = self.newest_serial();
+        let seen = |l: &&super::Landmark| Some(l.last_seen()) == newest;
+        self.landmarks.iter().filter(seen).count() as u32
+    }
+
+    /// Squared residuals of all that the newest frame's landmarks were seen as, over their degrees
+    /// of freedom: four coordinates a sight, less three unknowns a landmark, less six for each
+    /// frame's pose, in the share of its sights that count here. Large residuals count as Huber
+    /// weighs them.
+    fn measure_variance(&self) -> Option<f64> {
+        let newest = self.newest_serial()?;
+        let limit = 2.0 * 9.0 * self.variance.smoothed;
+        let (mut sum, mut freedom) = (0.0, 0.0);
+        let mut counted = [[0_u32; 2]; MAX_FRAMES];
+        for (i, landmark) in self.landmarks.iter().enumerate() {
+            let counts = landmark.last_seen() == newest && landmark.observations.len() > 1;
+            for o in &landmark.observations {
+                if let Some(frame) = self.frame_index(o.serial) {
+                    counted[frame][1] += 1;
+                    counted[frame][0] += u32::from(counts);
+                }
+                if let Some(e) = self.squared_sigmas(i, o.serial).filter(|_| counts) {
+                    sum += if e <= limit { e } else { (limit * e).sqrt() };
+                    freedom += 4.0;
+                }
+            }
+            if counts {
+                freedom -= 3.0;
+            }
+        }
+        for [here, all] in &counted[1..] {
+            freedom -= 6.0 * f64::from(*here) / f64::from((*all).max(1));
+        }
+        (freedom > 0.0).then(|| sum / freedom)
+    }
+
+    fn tracked(&self, joint: &Joint, variance_factor: f64, inliers: u32) -> Tracked {
+        let n = self.frames.len();
+        let newest = self.frames[n - 1].datum_from_frame;
+        let before = self.frames[n - 2].datum_from_frame;
+        let prev_from_now = before.inverse() * newest;
+        // x_now − Ad(now_from_prev) x_prev; the datum has no error of its own here.
+        let mut by_window = Matrix6xX::zeros(6 * (n - 1));
+        by_window
+            .fixed_columns_mut::<6>(6 * (n - 2))
+            .copy_from(&Matrix6::identity());
+        if n >= 3 {
+            by_window
+                .fixed_columns_mut::<6>(6 * (n - 3))
+                .copy_from(&-se3::adjoint(&prev_from_now.inverse()));
+        }
+        let cov: Matrix6<f64> = &by_window * joint * by_window.transpose();
+        Tracked {
+            odom_from_now: self.odom_from_newest(),
+            cov_pose_right: self.pose_covariance(&newest, joint),
+            motion: MotionEstimate {
+                prev_from_now,
+                cov_right: se3::symmetric(&cov),
+            },
+            variance_factor,
+            inliers,
+        }
+    }
+}

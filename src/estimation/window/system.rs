@@ -1,0 +1,283 @@
+//! The normal equations of a window: frames and landmarks in, the equations of the poses alone out.
+//!
+//! Each landmark's own three unknowns are eliminated as soon as its observations are linearised
+//! (Schur complement), so that cost grows linearly with the observations.
+
+use super::super::bundle::{huber_loss, huber_weight};
+use super::super::sight;
+use super::landmark::Landmark;
+use super::{Frame, MAX_FRAMES};
+use crate::geometry::{StereoRig, se3};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector4, Vector6};
+
+/// Normal equations, with the working memory for making them.
+#[derive(Clone, Debug, Default)]
+pub(super) struct System {
+    sightlines: Vec<Sightline>,
+    frame_count: usize,
+    /// Upper triangle of blocks, the datum's included.
+    blocks: Vec<Matrix6<f64>>,
+    gradients: Vec<Vector6<f64>>,
+    reduced: Vec<Reduced>,
+    crosses: Vec<Cross>,
+    touched: Vec<Cross>,
+}
+
+/// How one frame sees the landmarks of one anchor, and what they all say of it.
+#[derive(Clone, Debug)]
+struct Sightline {
+    frame_from_anchor: Isometry3<f64>,
+    /// The same where the Jacobians are taken, if elsewhere.
+    linearised: Option<Isometry3<f64>>,
+    adjoint: Matrix6<f64>,
+    information: Matrix6<f64>,
+    gradient: Vector6<f64>,
+    is_used: bool,
+}
+
+/// A landmark, eliminated.
+#[derive(Clone, Debug)]
+struct Reduced {
+    landmark: usize,
+    crosses: std::ops::Range<usize>,
+    cov: Matrix3<f64>,
+    gradient: Vector3<f64>,
+}
+
+/// What joins a landmark to a frame's pose.
+#[derive(Clone, Debug)]
+struct Cross {
+    frame: usize,
+    by_point: SMatrix<f64, 6, 3>,
+}
+
+impl System {
+    /// Linearises the observations of `landmarks` that lie in `frames`, but those of frame
+    /// `without`; information is divided by `variance_factor`. Returns the robust cost, in σ².
+    pub(super) fn build<'a>(
+        &mut self,
+        rig: &StereoRig,
+        frames: &[Frame],
+        landmarks: impl Iterator<Item = (usize, &'a Landmark)>,
+        without: Option<u64>,
+        variance_factor: f64,
+        damping: f64,
+    ) -> f64 {
+        self.begin(frames);
+        let mut cost = 0.0;
+        for (index, landmark) in landmarks {
+            cost += self
+                .eliminate(rig, frames, index, landmark, without, variance_factor, damping)
+                .unwrap_or(0.0);
+        }
+        self.expand_sightlines();
+        cost / variance_factor
+    }
+
+    fn begin(&mut self, frames: &[Frame]) {
+        let n = frames.len();
+        self.frame_count = n;
+        self.sightlines.clear();
+        for anchor in frames {
+            for frame in frames {
+                let current = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
+                let linearised = (anchor.linearised.is_some() || frame.linearised.is_some())
+                    .then(|| frame.datum_from_linearised().inverse() * anchor.datum_from_linearised());
+                self.sightlines.push(Sightline {
+                    adjoint: se3::adjoint(linearised.as_ref().unwrap_or(&current)),
+                    frame_from_anchor: current,
+                    linearised,
+                    information: Matrix6::zeros(),
+                    gradient: Vector6::zeros(),
+                    is_used: false,
+                });
+            }
+        }
+        self.blocks.clear();
+        self.blocks.resize(n * n, Matrix6::zeros());
+        self.gradients.clear();
+        self.gradients.resize(n, Vector6::zeros());
+        self.reduced.clear();
+        self.crosses.clear();
+    }
+
+    /// Adds a landmark's observations and eliminates its point. `None` if it has fewer than two or
+    /// cannot be seen from where it was observed.
+    #[expect(clippy::too_many_arguments, reason = "one call site; a struct would only rename them")]
+    fn eliminate(
+        &mut self,
+        rig: &StereoRig,
+        frames: &[Frame],
+        index: usize,
+        landmark: &Landmark,
+        without: Option<u64>,
+        variance_factor: f64,
+        damping: f64,
+    ) -> Option<f64> {
+        let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
+        let mut point_point = Matrix3::zeros();
+        let mut point_gradient = Vector3::zeros();
+        let mut cost = 0.0;
+        let first_cross = self.crosses.len();
+        let mut anchor_by_point = SMatrix::<f64, 6, 3>::zeros();
+        self.touched.clear();
+        let mut sights = 0;
+        for observation in &landmark.observations {
+            if Some(observation.serial) == without {
+                continue;
+            }
+            let Some(frame) = frames.iter().position(|f| f.serial == observation.serial) else {
+                continue;
+            };
+            let line = &mut self.sightlines[anchor * self.frame_count + frame];
+            let at = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
+            let Some(mut seen) = sight::linearise(rig, at, &landmark.inverse_depth) else {
+                continue;
+            };
+            if line.linearised.is_some() {
+                let Some(px) = sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
+                else {
+                    continue;
+                };
+                seen.px = px;
+            }
+            sights += 1;
+            let (info, residual, loss) = weigh(
+                &(observation.measurement.px - seen.px),
+                &observation.measurement.sigma_px,
+                variance_factor,
+            );
+            cost += loss;
+            let weighted = seen.by_point.transpose() * info;
+            point_point += weighted * seen.by_point;
+            point_gradient += weighted * residual;
+            if frame == anchor {
+                continue;
+            }
+            let weighted = seen.by_motion.transpose() * info;
+            line.information += weighted * seen.by_motion;
+            line.gradient += weighted * residual;
+            line.is_used = true;
+            let by_point = weighted * seen.by_point;
+            anchor_by_point -= line.adjoint.transpose() * by_point;
+            self.crosses.push(Cross { frame, by_point });
+        }
+        if sights < 2 {
+            self.crosses.truncate(first_cross);
+            return None;
+        }
+        self.crosses.push(Cross {
+            frame: anchor,
+            by_point: anchor_by_point,
+        });
+        for i in 0..3 {
+            point_point[(i, i)] *= 1.0 + damping;
+        }
+        let cov = point_point.cholesky()?.inverse();
+        let crosses = first_cross..self.crosses.len();
+        for i in crosses.clone() {
+            let a = &self.crosses[i];
+            let gain = a.by_point * cov;
+            self.gradients[a.frame] -= gain * point_gradient;
+            for b in &self.crosses[crosses.clone()] {
+                if a.frame <= b.frame {
+                    self.blocks[a.frame * self.frame_count + b.frame] -=
+                        gain * b.by_point.transpose();
+                }
+            }
+        }
+        self.reduced.push(Reduced {
+            landmark: index,
+            crosses,
+            cov,
+            gradient: point_gradient,
+        });
+        Some(cost)
+    }
+
+    /// Hands on what the sightlines gathered to the poses at their two ends.
+    fn expand_sightlines(&mut self) {
+        let n = self.frame_count;
+        for anchor in 0..n {
+            for frame in 0..n {
+                let line = &self.sightlines[anchor * n + frame];
+                if !line.is_used {
+                    continue;
+                }
+                let by_anchor = line.information * line.adjoint;
+                self.blocks[frame * n + frame] += line.information;
+                self.blocks[anchor * n + anchor] += line.adjoint.transpose() * by_anchor;
+                let (row, column, block) = if anchor < frame {
+                    (anchor, frame, by_anchor.transpose())
+                } else {
+                    (frame, anchor, by_anchor)
+                };
+                self.blocks[row * n + column] -= block;
+                self.gradients[frame] += line.gradient;
+                self.gradients[anchor] -= line.adjoint.transpose() * line.gradient;
+            }
+        }
+    }
+
+    /// The equations of all poses but the datum: full symmetric matrix and right side.
+    pub(super) fn assemble(&self) -> (DMatrix<f64>, DVector<f64>) {
+        let n = self.frame_count;
+        let dim = 6 * n.saturating_sub(1);
+        let mut hessian = DMatrix::zeros(dim, dim);
+        let mut gradient = DVector::zeros(dim);
+        for i in 1..n {
+            let r = 6 * (i - 1);
+            gradient.fixed_rows_mut::<6>(r).copy_from(&self.gradients[i]);
+            for j in i..n {
+                let c = 6 * (j - 1);
+                let block = &self.blocks[i * n + j];
+                hessian.fixed_view_mut::<6, 6>(r, c).copy_from(block);
+                if i != j {
+                    hessian
+                        .fixed_view_mut::<6, 6>(c, r)
+                        .copy_from(&block.transpose());
+                }
+            }
+        }
+        (hessian, gradient)
+    }
+
+    /// Moves the landmarks along with a step of the poses (all but the datum), and notes their
+    /// covariance.
+    pub(super) fn move_landmarks(&self, step: &DVector<f64>, landmarks: &mut [Landmark]) {
+        for r in &self.reduced {
+            let mut gradient = r.gradient;
+            for cross in &self.crosses[r.crosses.clone()] {
+                if cross.frame > 0 {
+                    let x = step.fixed_rows::<6>(6 * (cross.frame - 1));
+                    gradient -= cross.by_point.transpose() * x;
+                }
+            }
+            let landmark = &mut landmarks[r.landmark];
+            landmark.inverse_depth += r.cov * gradient;
+            landmark.cov = r.cov;
+        }
+    }
+}
+
+/// Robust information, the residual, and the loss (σ²) of one frame's measurement. Huber's bend
+/// stands at so many σ as residuals really have.
+fn weigh(
+    residual: &Vector4<f64>,
+    sigma_px: &Vector4<f64>,
+    variance_factor: f64,
+) -> (Matrix4<f64>, Vector4<f64>, f64) {
+    let scale = variance_factor.sqrt();
+    let normalised = residual.component_div(&(sigma_px * scale));
+    let (left, right) = (normalised.xy().norm(), normalised.fixed_rows::<2>(2).norm());
+    let (wl, wr) = (huber_weight(left), huber_weight(right));
+    let info = Vector4::new(wl, wl, wr, wr)
+        .component_div(&(sigma_px.component_mul(sigma_px) * variance_factor));
+    (
+        Matrix4::from_diagonal(&info),
+        *residual,
+        variance_factor * (huber_loss(left) + huber_loss(right)),
+    )
+}
+
+const _: () = assert!(MAX_FRAMES >= 3);
