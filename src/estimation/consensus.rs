@@ -66,7 +66,9 @@ impl Sighting {
         let info = Matrix4::from_diagonal(&p.prev.sigma_px.map(|s| 1.0 / (s * s)));
         Some(Self {
             inverse_depth: p.inverse_depth,
-            cov: (by_point.transpose() * info * by_point).cholesky()?.inverse(),
+            cov: (by_point.transpose() * info * by_point)
+                .cholesky()?
+                .inverse(),
             now: p.now,
         })
     }

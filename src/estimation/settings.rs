@@ -45,6 +45,11 @@ pub struct Settings {
     /// The same when landmarks have moved farther than this since the last keyframe (median). Share
     /// of the image's width, 0 to 1, default 0.015: what moves less says little of depth.
     pub keyframe_parallax: f64,
+    /// By how much calibration may leave the right image displaced, 1 σ of each coefficient of a
+    /// quadratic, where the rig does not state its own uncertainty: the window estimates it along
+    /// with the motion. px, 0 to 10, default 0.3: what published recordings show; 0 takes the
+    /// calibration as exact.
+    pub calibration_sigma_px: f64,
     /// Pairs without a measured motion that are bridged before the odometry frame begins anew. 0 to
     /// 10000, default 20.
     pub max_bridged: u32,
@@ -65,6 +70,7 @@ impl Default for Settings {
             gate_sigma2: 20.0,
             seed: 1,
             keyframes: 7,
+            calibration_sigma_px: 0.3,
             keyframe_survival: 0.7,
             keyframe_parallax: 0.015,
             max_bridged: 20,
@@ -87,6 +93,11 @@ impl Settings {
         SettingError::unless_in("keyframes", self.keyframes, 2..=12)?;
         SettingError::unless_in("keyframe_survival", self.keyframe_survival, 0.0..=1.0)?;
         SettingError::unless_in("keyframe_parallax", self.keyframe_parallax, 0.0..=1.0)?;
+        SettingError::unless_in(
+            "calibration_sigma_px",
+            self.calibration_sigma_px,
+            0.0..=10.0,
+        )?;
         SettingError::unless_in("max_bridged", self.max_bridged, 0..=10_000)?;
         SettingError::unless_in("acceleration_m_s2", self.acceleration_m_s2, 1e-6..=1000.0)?;
         SettingError::unless_in(

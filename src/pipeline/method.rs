@@ -7,9 +7,7 @@
 use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::StereoPair;
-use crate::estimation::{
-    self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement,
-};
+use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement};
 use crate::features::Features;
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{
@@ -167,8 +165,9 @@ impl Method {
         match &mut self.bench.odometer {
             Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
             Some(odometer) => odometer.begin(stamp, Counts::default()),
-            None => Odometer::new(self.bench.estimation.clone(), stamp)
-                .begin(stamp, Counts::default()),
+            None => {
+                Odometer::new(self.bench.estimation.clone(), stamp).begin(stamp, Counts::default())
+            }
         }
     }
 
@@ -292,8 +291,8 @@ mod tests {
         let mut unlike = described(1, &scene.before);
         unlike.right.features.descriptor_len = 32;
         let run = |spoilt: bool| {
-            let mut method = Method::new(rig(), flann.clone(), two_frame.clone())
-                .expect("has a baseline");
+            let mut method =
+                Method::new(rig(), flann.clone(), two_frame.clone()).expect("has a baseline");
             let first = method.step(&mut described(0, &scene.before));
             if spoilt {
                 assert!(method.step(&mut unlike.clone()).is_err());

@@ -9,7 +9,7 @@ use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings};
 use crate::geometry::StereoRig;
 use crate::matching::MatchError;
 use crate::refinement::{self, Appearance, Pyramid};
-use nalgebra::{Isometry3, Matrix6, Vector4};
+use nalgebra::{Isometry3, Vector4};
 use std::time::Instant;
 
 /// How far a patch may be from where the motion puts it, px.
@@ -36,12 +36,7 @@ pub(super) struct Windowed {
 impl Windowed {
     pub(super) fn new(rig: &StereoRig, settings: &Settings) -> Self {
         Self {
-            window: Window::new(
-                rig.clone(),
-                settings.clone(),
-                &Isometry3::identity(),
-                &Matrix6::zeros(),
-            ),
+            window: Window::new(rig.clone(), settings.clone()),
             gallery: Gallery::default(),
             images: Vec::new(),
             next_id: 0,
@@ -99,11 +94,9 @@ impl Windowed {
     /// Begins a window with the present pair where the odometer stands.
     fn begin(&mut self, bench: &mut Workbench, odometer: &Odometer) {
         let (odom_from_now, cov) = odometer.last_place();
-        let (rig, settings) = (bench.rig.clone(), bench.estimation.clone());
-        self.window = Window::new(rig, settings, &odom_from_now, &cov);
+        self.window.begin_at(&odom_from_now, &cov);
         self.gallery.clear();
         self.images.clear();
-        self.window.begin();
         self.is_known.clear();
         self.is_known.resize(bench.now.matches.len(), false);
         self.promote(bench);
@@ -165,11 +158,15 @@ impl Windowed {
     fn predict(&self, bench: &mut Workbench, newest_from_now: &Isometry3<f64>) {
         let now_from_newest = newest_from_now.inverse();
         bench.predicted.clear();
-        bench.predicted.extend(self.gallery.portraits.iter().map(|p| {
-            let landmark = self.window.landmark(p.id)?;
-            let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
-            estimation::seen_at(&bench.rig, &now_from_anchor, &landmark.inverse_depth)
-        }));
+        bench
+            .predicted
+            .extend(self.gallery.portraits.iter().map(|p| {
+                let landmark = self.window.landmark(p.id)?;
+                let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
+                let px =
+                    estimation::seen_at(&bench.rig, &now_from_anchor, &landmark.inverse_depth)?;
+                Some(self.window.expected_px(&px))
+            }));
     }
 
     /// The motion that the recognised landmarks agree on.
@@ -266,8 +263,7 @@ impl Windowed {
             }
         }
         self.gallery.retain(|p| {
-            p.missed <= MAX_MISSED
-                && window.landmark(p.id).is_some_and(|l| l.wrong <= MAX_WRONG)
+            p.missed <= MAX_MISSED && window.landmark(p.id).is_some_and(|l| l.wrong <= MAX_WRONG)
         });
         let mut image = self.release_image();
         std::mem::swap(&mut image, &mut bench.now.pair.left.pyramid);
@@ -330,6 +326,5 @@ impl Windowed {
 
 /// Whether both cameras see something at these positions.
 fn is_inside(rig: &StereoRig, px: &Vector4<f64>) -> bool {
-    rig.left.contains(&px.xy(), 0.0)
-        && rig.right.contains(&px.fixed_rows::<2>(2).into_owned(), 0.0)
+    rig.left.contains(&px.xy(), 0.0) && rig.right.contains(&px.fixed_rows::<2>(2).into_owned(), 0.0)
 }

@@ -38,7 +38,7 @@ pub struct Appearance<'a> {
 /// A keypoint of this diameter or less is sought on the finest level, px.
 const FINEST_SIZE_PX: f64 = 10.0;
 /// What alignment leaves however good the contrast: interpolation, warp. px of the level.
-const FLOOR_PX: f64 = 0.03;
+const FLOOR_PX: f64 = 0.05;
 /// How far a finer level may move what a coarser one found, px of the finer level.
 const FINER_REACH_PX: f32 = 2.0;
 
@@ -68,7 +68,10 @@ pub fn refine(
         let warp: Matrix2<f64> = now.fixed_view::<2, 2>(side, 0) * by_px;
         let from = Vector2::new(start[side], start[side + 1]);
         let found = coarse_to_fine(appearance, image, &warp, &from, reach_px)?;
-        measurement.px.fixed_rows_mut::<2>(side).copy_from(&found.px);
+        measurement
+            .px
+            .fixed_rows_mut::<2>(side)
+            .copy_from(&found.px);
         measurement
             .sigma_px
             .fixed_rows_mut::<2>(side)

@@ -26,6 +26,9 @@ const MIN_STEP: f32 = 0.003;
 const MIN_CONTRAST: f32 = 2.0;
 /// Least correlation of what was found with the template.
 const MIN_CORRELATION: f32 = 0.8;
+/// Neighbouring samples share their deviations, what smoothing and interpolation did to the image's
+/// noise and what a warp that is not quite right does: so many count as one.
+const SHARED: f32 = 4.0;
 /// Rounding to whole grey levels, once in each image: variance 1/12 each, less what smoothing takes.
 const ROUNDING_VARIANCE: f32 = 0.1;
 
@@ -165,7 +168,7 @@ impl Template {
         }
         // Four parameters were fitted; template and target have half of the misfit each.
         let variance = misfit / (AREA - 4) as f32;
-        let share = 0.5 * variance + ROUNDING_VARIANCE;
+        let share = SHARED * (0.5 * variance + ROUNDING_VARIANCE);
         Some(Aligned {
             at,
             cov: self.inverse * share,

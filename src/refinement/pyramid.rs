@@ -125,9 +125,13 @@ mod tests {
         for level in 0..LEVELS {
             let image = pyramid.level(level);
             let (x, y) = (image.width() / 2, image.height() / 2);
-            let truth = 2.0 * from_level(f64::from(x), level) + 3.0 * from_level(f64::from(y), level);
+            let truth =
+                2.0 * from_level(f64::from(x), level) + 3.0 * from_level(f64::from(y), level);
             let seen = f64::from(image.row(y)[x as usize]);
-            assert!((seen - truth).abs() <= 1.0, "level {level}: {seen} for {truth}");
+            assert!(
+                (seen - truth).abs() <= 1.0,
+                "level {level}: {seen} for {truth}"
+            );
         }
     }
 

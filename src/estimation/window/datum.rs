@@ -1,11 +1,12 @@
 //! The datum: where the window's oldest keyframe stands in the odometry frame.
 //!
-//! Its error (right perturbation) is `δ₀ = B x + β + ε`: `x` are the window's relative poses,
-//! counted from where the prior was linearised, `ε` is independent of them and of all that is yet
+//! Its error (right perturbation) is `δ₀ = B x + β + ε`: `x` are the warp and the window's relative
+//! poses, counted from where the prior was linearised, `ε` is independent of them and of all that is yet
 //! to come. So the past is corrected by what the window learns, and the pose's covariance has every
 //! correlation in it.
 
-use super::{Frame, Joint};
+use super::warp::WARP;
+use super::{Frame, Joint, row_of};
 use crate::geometry::se3;
 use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
 
@@ -13,7 +14,7 @@ use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
 #[derive(Clone, Debug)]
 pub(super) struct Datum {
     odom_from_linearised: Isometry3<f64>,
-    /// `B`, 6 rows; columns for the frames that the prior knows.
+    /// `B`, 6 rows; columns for the warp and the frames that the prior knows.
     by_window: Matrix6xX<f64>,
     /// `β`.
     offset: Vector6<f64>,
@@ -25,7 +26,7 @@ impl Datum {
     pub(super) fn new(odom_from_datum: &Isometry3<f64>, cov: &Matrix6<f64>) -> Self {
         Self {
             odom_from_linearised: *odom_from_datum,
-            by_window: Matrix6xX::zeros(0),
+            by_window: Matrix6xX::zeros(WARP),
             offset: Vector6::zeros(),
             cov: *cov,
         }
@@ -41,8 +42,8 @@ impl Datum {
     }
 
     /// The covariance (right perturbation) of the pose of the last frame in the window, which
-    /// stands at `datum_from_last`; `cov_window` is the joint covariance of all poses but the
-    /// datum's.
+    /// stands at `datum_from_last`; `cov_window` is the joint covariance of the warp and all
+    /// poses but the datum's.
     pub(super) fn covariance_of(
         &self,
         datum_from_last: &Isometry3<f64>,
@@ -55,7 +56,7 @@ impl Datum {
         by_window
             .columns_mut(0, known)
             .copy_from(&(carry * self.by_window.columns(0, known)));
-        if n >= 6 {
+        if n >= WARP + 6 {
             let mut own = by_window.columns_mut(n - 6, 6);
             own += Matrix6::<f64>::identity();
         }
@@ -75,20 +76,25 @@ impl Datum {
     ) {
         let linearised = *frames[1].datum_from_linearised();
         let carry = se3::adjoint(&linearised.inverse());
-        let rest = 6 * (frames.len() - 2);
+        let rest = row_of(frames.len() - 1);
         let known = self.by_window.ncols();
         let old: Matrix6xX<f64> = carry * &self.by_window;
         // By x₁, itself included, through all that moved with it.
         let mut by_first = Matrix6::identity();
         let mut by_window = Matrix6xX::zeros(rest);
-        if known > 0 {
-            by_first += old.fixed_columns::<6>(0);
+        by_window
+            .fixed_columns_mut::<WARP>(0)
+            .copy_from(&old.fixed_columns::<WARP>(0));
+        if known > WARP {
+            by_first += old.fixed_columns::<6>(WARP);
             for (i, along) in moved.iter().enumerate() {
-                let at = 6 * (i + 1);
+                let at = row_of(i + 2);
                 if at < known {
                     let block = old.fixed_columns::<6>(at).into_owned();
                     by_first += block * along;
-                    by_window.fixed_columns_mut::<6>(6 * i).copy_from(&block);
+                    by_window
+                        .fixed_columns_mut::<6>(row_of(i + 1))
+                        .copy_from(&block);
                 }
             }
         }

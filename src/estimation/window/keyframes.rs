@@ -1,6 +1,6 @@
 //! Keyframes: which frames stay in the window, and how the oldest leaves it.
 
-use super::{Landmark, Seen, Window};
+use super::{Landmark, Seen, Window, row_of};
 use crate::geometry::se3;
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, MatrixXx6, Vector6};
 
@@ -17,10 +17,20 @@ impl Window {
             self.marginalise_oldest(newest);
         }
         for s in new {
-            self.landmarks
-                .extend(Landmark::new(&self.rig, s.id, newest, s.measurement));
+            let calibrated = self.warp.corrected(&s.measurement);
+            self.landmarks.extend(Landmark::new(
+                &self.rig,
+                s.id,
+                newest,
+                s.measurement,
+                &calibrated,
+            ));
         }
-        let seen = self.landmarks.iter().filter(|l| l.last_seen() == newest).count();
+        let seen = self
+            .landmarks
+            .iter()
+            .filter(|l| l.last_seen() == newest)
+            .count();
         if let Some(frame) = self.frames.last_mut() {
             frame.is_keyframe = true;
             frame.landmarks = seen;
@@ -85,11 +95,19 @@ impl Window {
             .enumerate()
             .filter(|(_, l)| l.anchor == oldest);
         let variance = self.variance.smoothed;
-        system.build(&self.rig, &self.frames, leaving, Some(newest), variance, 0.0);
+        system.build(
+            &self.rig,
+            &self.warp,
+            &self.frames,
+            leaving,
+            Some(newest),
+            variance,
+            0.0,
+        );
         let (mut hessian, mut gradient) = system.assemble();
         self.system = system;
         // From "at the current poses" to "counted from where they are linearised".
-        let offsets = self.prior.offsets(&self.frames);
+        let offsets = self.prior.offsets(&self.warp, &self.frames);
         gradient += &hessian * offsets;
         let m = self.prior.vector.len();
         let mut top = hessian.view_mut((0, 0), (m, m));
@@ -103,32 +121,40 @@ impl Window {
     /// Expresses everything relative to frame 1 and eliminates its pose.
     fn move_datum(&mut self, hessian: &DMatrix<f64>, gradient: &DVector<f64>) {
         let first_linearised = *self.frames[1].datum_from_linearised();
-        let rest = 6 * (self.frames.len() - 2);
+        let all = row_of(self.frames.len());
+        let rest = all - 6;
         // xᵢ = x'ᵢ + Ad(frame i ← frame 1) x₁.
         let moved: Vec<Matrix6<f64>> = self.frames[2..]
             .iter()
             .map(|f| se3::adjoint(&(f.datum_from_linearised().inverse() * first_linearised)))
             .collect();
-        let mut along = MatrixXx6::zeros(rest + 6);
-        along.fixed_rows_mut::<6>(0).copy_from(&Matrix6::identity());
+        let mut along = MatrixXx6::zeros(all);
+        along
+            .fixed_rows_mut::<6>(row_of(1))
+            .copy_from(&Matrix6::identity());
         for (i, block) in moved.iter().enumerate() {
-            along.fixed_rows_mut::<6>(6 * (i + 1)).copy_from(block);
+            along.fixed_rows_mut::<6>(row_of(i + 2)).copy_from(block);
         }
         let by_first = hessian * &along;
         let first: Matrix6<f64> = along.transpose() * &by_first;
-        let cross = by_first.rows(6, rest).into_owned();
         let first_gradient: Vector6<f64> = along.transpose() * gradient;
         // Without anything that holds frame 1 nothing can be handed on; the datum's own
         // uncertainty then has to grow beyond bounds, which the ridge expresses.
         let cov_first = invert_or_ridge(&se3::symmetric(&first));
         let mean = cov_first * first_gradient;
+        let cross = by_first.remove_fixed_rows::<6>(row_of(1));
         let by_rest: Matrix6xX<f64> = -(cov_first * cross.transpose());
-        let information = hessian.view((6, 6), (rest, rest)) + &cross * &by_rest;
+        let hessian = hessian
+            .clone()
+            .remove_fixed_rows::<6>(row_of(1))
+            .remove_fixed_columns::<6>(row_of(1));
+        let information = hessian + &cross * &by_rest;
         // The newest frame, last in the window, took no part.
         let known = rest - 6;
         let symmetric = (&information + information.transpose()) * 0.5;
         self.prior.information = symmetric.view((0, 0), (known, known)).into_owned();
-        self.prior.vector = (gradient.rows(6, rest) - &cross * mean).rows(0, known).into_owned();
+        let gradient = gradient.clone().remove_fixed_rows::<6>(row_of(1)) - &cross * mean;
+        self.prior.vector = gradient.rows(0, known).into_owned();
         self.datum
             .advance(&self.frames, &moved, &mean, &by_rest, &cov_first);
         let first = self.frames[1].datum_from_frame;
@@ -143,7 +169,7 @@ impl Window {
     }
 
     fn restart_landmarks(&mut self, oldest: u64, newest: u64) {
-        let rig = &self.rig;
+        let (rig, warp) = (&self.rig, &self.warp);
         self.landmarks.retain_mut(|landmark| {
             if landmark.anchor != oldest {
                 return true;
@@ -151,7 +177,8 @@ impl Window {
             let Some(last) = landmark.observations.last().filter(|o| o.serial == newest) else {
                 return false;
             };
-            match Landmark::new(rig, landmark.id, newest, last.measurement) {
+            let calibrated = warp.corrected(&last.measurement);
+            match Landmark::new(rig, landmark.id, newest, last.measurement, &calibrated) {
                 Some(anew) => {
                     *landmark = anew;
                     true
@@ -172,5 +199,7 @@ fn invert_or_ridge(information: &Matrix6<f64>) -> Matrix6<f64> {
     let ridge = Matrix6::identity() / (UNBOUND_SIGMA * UNBOUND_SIGMA);
     (information + ridge)
         .try_inverse()
-        .map_or(Matrix6::identity() * (UNBOUND_SIGMA * UNBOUND_SIGMA), |m| se3::symmetric(&m))
+        .map_or(Matrix6::identity() * (UNBOUND_SIGMA * UNBOUND_SIGMA), |m| {
+            se3::symmetric(&m)
+        })
 }

@@ -34,18 +34,22 @@ pub struct Landmark {
 }
 
 impl Landmark {
-    /// A landmark that its anchor alone has seen. `None` where the sights do not meet.
+    /// A landmark that its anchor alone has seen; `calibrated` is the measurement as a rig as
+    /// calibrated would have made it. `None` where the sights do not meet.
     #[must_use]
     pub fn new(
         rig: &StereoRig,
         id: LandmarkId,
         anchor: u64,
         measurement: StereoMeasurement,
+        calibrated: &StereoMeasurement,
     ) -> Option<Self> {
-        let inverse_depth = sight::inverse_depth(rig, &measurement)?;
+        let inverse_depth = sight::inverse_depth(rig, calibrated)?;
         let by_point = sight::linearise(rig, &Isometry3::identity(), &inverse_depth)?.by_point;
         let info = Matrix4::from_diagonal(&measurement.sigma_px.map(|s| 1.0 / (s * s)));
-        let cov = (by_point.transpose() * info * by_point).cholesky()?.inverse();
+        let cov = (by_point.transpose() * info * by_point)
+            .cholesky()?
+            .inverse();
         Some(Self {
             id,
             anchor,
@@ -86,7 +90,10 @@ impl Landmark {
     /// The point in another frame: (x, y, ρ) there, and its covariance. `None` where it lies behind
     /// that frame's camera.
     #[must_use]
-    pub fn seen_from(&self, other_from_anchor: &Isometry3<f64>) -> Option<(Vector3<f64>, Matrix3<f64>)> {
+    pub fn seen_from(
+        &self,
+        other_from_anchor: &Isometry3<f64>,
+    ) -> Option<(Vector3<f64>, Matrix3<f64>)> {
         let rotation = other_from_anchor.rotation.to_rotation_matrix();
         let r = rotation.matrix();
         let t = other_from_anchor.translation.vector;

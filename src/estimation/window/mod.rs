@@ -25,6 +25,7 @@ mod solve;
 mod system;
 #[cfg(test)]
 mod tests;
+mod warp;
 
 pub use landmark::{Landmark, LandmarkId, Observation};
 pub use solve::Consent;
@@ -33,9 +34,15 @@ use super::closed_form::MotionEstimate;
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
 use datum::Datum;
-use nalgebra::{Isometry3, Matrix6};
+use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector4};
 use prior::Prior;
 use system::System;
+use warp::{WARP, Warp};
+
+/// Where the unknowns of frame `i` begin, i > 0.
+const fn row_of(i: usize) -> usize {
+    WARP + 6 * (i - 1)
+}
 
 /// Frames in the window at most: keyframes, the last frame and the current one.
 const MAX_FRAMES: usize = 16;
@@ -64,6 +71,8 @@ impl Frame {
 #[derive(Clone, Debug)]
 pub struct Window {
     rig: StereoRig,
+    warp: Warp,
+    cov_warp: SMatrix<f64, WARP, WARP>,
     settings: Settings,
     datum: Datum,
     prior: Prior,
@@ -96,19 +105,18 @@ impl VarianceFactor {
 const MIN_VARIANCE_FACTOR: f64 = 0.25;
 
 impl Window {
-    /// An empty window whose first frame stands at `odom_from_first`, known to `cov_right`.
+    /// An empty window, to be [begun](Self::begin_at).
     #[must_use]
-    pub fn new(
-        rig: StereoRig,
-        settings: Settings,
-        odom_from_first: &Isometry3<f64>,
-        cov_right: &Matrix6<f64>,
-    ) -> Self {
+    pub fn new(rig: StereoRig, settings: Settings) -> Self {
+        let warp = Warp::new(&rig);
+        let cov_warp = warp::prior_covariance(&rig, &settings);
         Self {
+            prior: Prior::new(&warp, &cov_warp),
             rig,
+            warp,
+            cov_warp,
             settings,
-            datum: Datum::new(odom_from_first, cov_right),
-            prior: Prior::default(),
+            datum: Datum::new(&Isometry3::identity(), &Matrix6::zeros()),
             frames: Vec::with_capacity(MAX_FRAMES),
             landmarks: Vec::new(),
             next_serial: 0,
@@ -118,6 +126,36 @@ impl Window {
             },
             system: System::default(),
         }
+    }
+
+    /// A measurement as the rig would have made it if it were as calibrated.
+    #[must_use]
+    pub fn corrected(&self, measurement: &StereoMeasurement) -> StereoMeasurement {
+        self.warp.corrected(measurement)
+    }
+
+    /// Where the rig as it is sees what it would see at `px` if it were as calibrated.
+    #[must_use]
+    pub fn expected_px(&self, px: &Vector4<f64>) -> Vector4<f64> {
+        let at = StereoMeasurement {
+            px: *px,
+            sigma_px: Vector4::zeros(),
+        };
+        px * 2.0 - self.warp.corrected(&at).px
+    }
+
+    /// By how much the right image is displaced from what the calibration says, px: along the
+    /// baseline, then the coefficients of 1, x, y, x², xy, y² across it, positions counted from the
+    /// image's centre in halves of its width.
+    #[must_use]
+    pub fn warp_px(&self) -> [f64; 7] {
+        self.warp.coefficients.into()
+    }
+
+    /// 1 σ of [`warp_px`](Self::warp_px).
+    #[must_use]
+    pub fn sigma_warp_px(&self) -> [f64; 7] {
+        std::array::from_fn(|i| self.cov_warp[(i, i)].sqrt())
     }
 
     /// The landmarks, with rising ids.
@@ -142,8 +180,11 @@ impl Window {
     /// Pose of the newest frame in the odometry frame.
     #[must_use]
     pub fn odom_from_newest(&self) -> Isometry3<f64> {
-        let x = self.prior.offsets(&self.frames);
-        let newest = self.frames.last().map_or_else(Isometry3::identity, |f| f.datum_from_frame);
+        let x = self.prior.offsets(&self.warp, &self.frames);
+        let newest = self
+            .frames
+            .last()
+            .map_or_else(Isometry3::identity, |f| f.datum_from_frame);
         self.datum.pose(&x) * newest
     }
 
@@ -172,7 +213,10 @@ impl Window {
 
     /// The serials of the keyframes, oldest first.
     pub fn keyframe_serials(&self) -> impl Iterator<Item = u64> + '_ {
-        self.frames.iter().filter(|f| f.is_keyframe).map(|f| f.serial)
+        self.frames
+            .iter()
+            .filter(|f| f.is_keyframe)
+            .map(|f| f.serial)
     }
 
     fn frame_index(&self, serial: u64) -> Option<usize> {
@@ -184,8 +228,9 @@ impl Window {
     }
 }
 
-/// The joint covariance of the window's poses but the datum, six rows each.
-type Joint = nalgebra::DMatrix<f64>;
+/// The joint covariance of the warp, and of the window's poses but the
+/// datum, six rows each.
+type Joint = DMatrix<f64>;
 
 /// What one frame came to.
 #[derive(Clone, Copy, Debug)]

@@ -1,12 +1,13 @@
 //! The prior: what frames that left the window said about those that are still in it.
 //!
-//! A Gaussian in information form over the right perturbations `x` of the poses of frames 1 … m
-//! (relative to the datum, frame 0), each counted from where the prior was linearised:
-//! cost `½ xᵀ H x − bᵀ x`.
+//! A Gaussian in information form over the warp and the right perturbations of
+//! the poses of frames 1 … m (relative to the datum, frame 0), together `x`, each counted from
+//! where the prior was linearised: cost `½ xᵀ H x − bᵀ x`.
 
-use super::Frame;
+use super::warp::{WARP, Warp};
+use super::{Frame, row_of};
 use crate::geometry::se3;
-use nalgebra::{DMatrix, DVector, Isometry3};
+use nalgebra::{DMatrix, DVector, Isometry3, SMatrix};
 
 /// What is known before the window's own measurements.
 #[derive(Clone, Debug)]
@@ -15,24 +16,31 @@ pub(super) struct Prior {
     pub(super) vector: DVector<f64>,
 }
 
-impl Default for Prior {
-    fn default() -> Self {
-        Self {
-            information: DMatrix::zeros(0, 0),
-            vector: DVector::zeros(0),
-        }
-    }
-}
-
 impl Prior {
-    /// How far the poses of frames 1 … stand from where they were linearised; zero for those that
-    /// the prior does not know.
-    pub(super) fn offsets(&self, frames: &[Frame]) -> DVector<f64> {
-        let mut x = DVector::zeros(6 * frames.len().saturating_sub(1));
+    /// Nothing is known but the warp, which is as given, with a covariance.
+    pub(super) fn new(warp: &Warp, cov: &SMatrix<f64, WARP, WARP>) -> Self {
+        let information = cov
+            .cholesky()
+            .map_or_else(SMatrix::identity, |c| c.inverse());
+        let mut prior = Self {
+            information: DMatrix::zeros(WARP, WARP),
+            vector: DVector::zeros(WARP),
+        };
+        prior.information.copy_from(&information);
+        prior.vector.copy_from(&(information * warp.coefficients));
+        prior
+    }
+
+    /// The warp, and how far the poses of frames 1 … stand from where they were
+    /// linearised; zero for those that the prior does not know.
+    pub(super) fn offsets(&self, warp: &Warp, frames: &[Frame]) -> DVector<f64> {
+        let mut x = DVector::zeros(row_of(frames.len().max(1)));
+        x.fixed_rows_mut::<WARP>(0).copy_from(&warp.coefficients);
         for (i, frame) in frames.iter().enumerate().skip(1) {
             if let Some(linearised) = &frame.linearised {
                 let offset: Isometry3<f64> = linearised.inverse() * frame.datum_from_frame;
-                x.fixed_rows_mut::<6>(6 * (i - 1)).copy_from(&se3::log(&offset));
+                x.fixed_rows_mut::<6>(row_of(i))
+                    .copy_from(&se3::log(&offset));
             }
         }
         x
@@ -41,15 +49,13 @@ impl Prior {
     /// Adds the prior to equations that are linearised at the current poses. Returns its cost.
     pub(super) fn add_to(
         &self,
+        warp: &Warp,
         frames: &[Frame],
         hessian: &mut DMatrix<f64>,
         gradient: &mut DVector<f64>,
     ) -> f64 {
         let m = self.vector.len();
-        if m == 0 {
-            return 0.0;
-        }
-        let x = self.offsets(frames).rows(0, m).into_owned();
+        let x = self.offsets(warp, frames).rows(0, m).into_owned();
         let by_x = &self.information * &x;
         let mut top = hessian.view_mut((0, 0), (m, m));
         top += &self.information;

@@ -3,9 +3,12 @@
 use super::super::closed_form::MotionEstimate;
 use super::super::consensus::{self, Search, Sighting};
 use super::super::sight;
-use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window};
+use super::datum::Datum;
+use super::prior::Prior;
+use super::warp::{WARP, Warp};
+use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
 use crate::geometry::se3;
-use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
+use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector3, Vector6};
 
 /// A frame's motion that many of its sights agree on, before adjustment.
 #[derive(Clone, Debug)]
@@ -25,9 +28,12 @@ const MIN_GAIN: f64 = 1e-4;
 const ROUNDS: usize = 3;
 
 impl Window {
-    /// Begins with a first frame, which is a keyframe without landmarks as yet.
-    pub fn begin(&mut self) {
+    /// Begins, or begins anew, with a frame that stands at `odom_from_first`, known to `cov_right`:
+    /// a keyframe without landmarks as yet. What was learnt of the rig is kept.
+    pub fn begin_at(&mut self, odom_from_first: &Isometry3<f64>, cov_right: &Matrix6<f64>) {
         let serial = self.take_serial();
+        self.datum = Datum::new(odom_from_first, cov_right);
+        self.prior = Prior::new(&self.warp, &self.cov_warp);
         self.frames.clear();
         self.landmarks.clear();
         self.frames.push(Frame {
@@ -56,7 +62,7 @@ impl Window {
                 Some(Sighting {
                     inverse_depth,
                     cov: cov * scale,
-                    now: s.measurement,
+                    now: self.warp.corrected(&s.measurement),
                 })
             });
             if let Some(sighting) = sighting {
@@ -79,7 +85,10 @@ impl Window {
 
     /// Adds the current frame, which stands at `newest_from_now`, with its sights of landmarks.
     pub fn add(&mut self, newest_from_now: &Isometry3<f64>, seen: &[Seen]) {
-        let newest = self.frames.last().map_or_else(Isometry3::identity, |f| f.datum_from_frame);
+        let newest = self
+            .frames
+            .last()
+            .map_or_else(Isometry3::identity, |f| f.datum_from_frame);
         let serial = self.take_serial();
         self.frames.push(Frame {
             serial,
@@ -147,6 +156,7 @@ impl Window {
         }
         let variance_factor = self.measure_variance()?;
         self.variance.take(variance_factor);
+        self.cov_warp = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
         Some(self.tracked(&joint, variance_factor, inliers))
     }
 
@@ -156,17 +166,27 @@ impl Window {
         let variance = self.variance.smoothed;
         let mut damping = 0.0;
         let mut system = std::mem::take(&mut self.system);
-        let mut kept: Option<(Vec<Frame>, Vec<nalgebra::Vector3<f64>>, f64)> = None;
+        let mut kept: Option<(Warp, Vec<Frame>, Vec<Vector3<f64>>, f64)> = None;
         let mut result = None;
         for _ in 0..MAX_ITERATIONS {
             let landmarks = self.landmarks.iter().enumerate();
-            let mut cost =
-                system.build(&self.rig, &self.frames, landmarks, None, variance, damping);
+            let mut cost = system.build(
+                &self.rig,
+                &self.warp,
+                &self.frames,
+                landmarks,
+                None,
+                variance,
+                damping,
+            );
             let (mut hessian, mut gradient) = system.assemble();
-            cost += self.prior.add_to(&self.frames, &mut hessian, &mut gradient);
-            if let Some((frames, points, before)) = &kept
+            cost += self
+                .prior
+                .add_to(&self.warp, &self.frames, &mut hessian, &mut gradient);
+            if let Some((warp, frames, points, before)) = &kept
                 && cost > before + 1e-9 * before.abs()
             {
+                self.warp.clone_from(warp);
                 self.frames.clone_from(frames);
                 for (landmark, point) in self.landmarks.iter_mut().zip(points) {
                     landmark.inverse_depth = *point;
@@ -197,6 +217,7 @@ impl Window {
                 break;
             }
             kept = Some((
+                self.warp.clone(),
                 self.frames.clone(),
                 self.landmarks.iter().map(|l| l.inverse_depth).collect(),
                 cost,
@@ -211,8 +232,9 @@ impl Window {
     }
 
     fn move_frames(&mut self, step: &DVector<f64>) {
+        self.warp.step(step);
         for (i, frame) in self.frames.iter_mut().enumerate().skip(1) {
-            let x: Vector6<f64> = step.fixed_rows::<6>(6 * (i - 1)).into_owned();
+            let x: Vector6<f64> = step.fixed_rows::<6>(row_of(i)).into_owned();
             // Counted from where Jacobians are taken, so that steps add up as the prior counts them.
             frame.datum_from_frame = match &frame.linearised {
                 Some(linearised) => {
@@ -254,7 +276,7 @@ impl Window {
         let observation = landmark.observations.iter().find(|o| o.serial == serial)?;
         let frame_from_anchor = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
         let seen = sight::seen_at(&self.rig, &frame_from_anchor, &landmark.inverse_depth)?;
-        let m = &observation.measurement;
+        let m = self.warp.corrected(&observation.measurement);
         Some((m.px - seen).component_div(&m.sigma_px).norm_squared())
     }
 
@@ -301,13 +323,13 @@ impl Window {
         let before = self.frames[n - 2].datum_from_frame;
         let prev_from_now = before.inverse() * newest;
         // x_now − Ad(now_from_prev) x_prev; the datum has no error of its own here.
-        let mut by_window = Matrix6xX::zeros(6 * (n - 1));
+        let mut by_window = Matrix6xX::zeros(row_of(n));
         by_window
-            .fixed_columns_mut::<6>(6 * (n - 2))
+            .fixed_columns_mut::<6>(row_of(n - 1))
             .copy_from(&Matrix6::identity());
         if n >= 3 {
             by_window
-                .fixed_columns_mut::<6>(6 * (n - 3))
+                .fixed_columns_mut::<6>(row_of(n - 2))
                 .copy_from(&-se3::adjoint(&prev_from_now.inverse()));
         }
         let cov: Matrix6<f64> = &by_window * joint * by_window.transpose();

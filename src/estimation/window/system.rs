@@ -6,9 +6,13 @@
 use super::super::bundle::{huber_loss, huber_weight};
 use super::super::sight;
 use super::landmark::Landmark;
-use super::{Frame, MAX_FRAMES};
+use super::warp::{WARP, Warp};
+use super::{Frame, row_of};
 use crate::geometry::{StereoRig, se3};
-use nalgebra::{DMatrix, DVector, Isometry3, Matrix3, Matrix4, Matrix6, SMatrix, Vector3, Vector4, Vector6};
+use nalgebra::{
+    DMatrix, DVector, Isometry3, Matrix3, Matrix4, Matrix6, SMatrix, SVector, Vector3, Vector4,
+    Vector6,
+};
 
 /// Normal equations, with the working memory for making them.
 #[derive(Clone, Debug, Default)]
@@ -18,9 +22,11 @@ pub(super) struct System {
     /// Upper triangle of blocks, the datum's included.
     blocks: Vec<Matrix6<f64>>,
     gradients: Vec<Vector6<f64>>,
+    by_warp: Vec<SMatrix<f64, 6, WARP>>,
+    warp_warp: SMatrix<f64, WARP, WARP>,
+    warp_gradient: SVector<f64, WARP>,
     reduced: Vec<Reduced>,
     crosses: Vec<Cross>,
-    touched: Vec<Cross>,
 }
 
 /// How one frame sees the landmarks of one anchor, and what they all say of it.
@@ -31,6 +37,7 @@ struct Sightline {
     linearised: Option<Isometry3<f64>>,
     adjoint: Matrix6<f64>,
     information: Matrix6<f64>,
+    by_warp: SMatrix<f64, 6, WARP>,
     gradient: Vector6<f64>,
     is_used: bool,
 }
@@ -42,6 +49,7 @@ struct Reduced {
     crosses: std::ops::Range<usize>,
     cov: Matrix3<f64>,
     gradient: Vector3<f64>,
+    by_warp: SMatrix<f64, WARP, 3>,
 }
 
 /// What joins a landmark to a frame's pose.
@@ -57,6 +65,7 @@ impl System {
     pub(super) fn build<'a>(
         &mut self,
         rig: &StereoRig,
+        warp: &Warp,
         frames: &[Frame],
         landmarks: impl Iterator<Item = (usize, &'a Landmark)>,
         without: Option<u64>,
@@ -67,7 +76,16 @@ impl System {
         let mut cost = 0.0;
         for (index, landmark) in landmarks {
             cost += self
-                .eliminate(rig, frames, index, landmark, without, variance_factor, damping)
+                .eliminate(
+                    rig,
+                    warp,
+                    frames,
+                    index,
+                    landmark,
+                    without,
+                    variance_factor,
+                    damping,
+                )
                 .unwrap_or(0.0);
         }
         self.expand_sightlines();
@@ -81,13 +99,16 @@ impl System {
         for anchor in frames {
             for frame in frames {
                 let current = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
-                let linearised = (anchor.linearised.is_some() || frame.linearised.is_some())
-                    .then(|| frame.datum_from_linearised().inverse() * anchor.datum_from_linearised());
+                let linearised =
+                    (anchor.linearised.is_some() || frame.linearised.is_some()).then(|| {
+                        frame.datum_from_linearised().inverse() * anchor.datum_from_linearised()
+                    });
                 self.sightlines.push(Sightline {
                     adjoint: se3::adjoint(linearised.as_ref().unwrap_or(&current)),
                     frame_from_anchor: current,
                     linearised,
                     information: Matrix6::zeros(),
+                    by_warp: SMatrix::zeros(),
                     gradient: Vector6::zeros(),
                     is_used: false,
                 });
@@ -97,16 +118,24 @@ impl System {
         self.blocks.resize(n * n, Matrix6::zeros());
         self.gradients.clear();
         self.gradients.resize(n, Vector6::zeros());
+        self.by_warp.clear();
+        self.by_warp.resize(n, SMatrix::zeros());
+        self.warp_warp = SMatrix::zeros();
+        self.warp_gradient = SVector::zeros();
         self.reduced.clear();
         self.crosses.clear();
     }
 
     /// Adds a landmark's observations and eliminates its point. `None` if it has fewer than two or
     /// cannot be seen from where it was observed.
-    #[expect(clippy::too_many_arguments, reason = "one call site; a struct would only rename them")]
+    #[expect(
+        clippy::too_many_arguments,
+        reason = "one call site; a struct would only rename them"
+    )]
     fn eliminate(
         &mut self,
         rig: &StereoRig,
+        warp: &Warp,
         frames: &[Frame],
         index: usize,
         landmark: &Landmark,
@@ -117,10 +146,12 @@ impl System {
         let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
         let mut point_point = Matrix3::zeros();
         let mut point_gradient = Vector3::zeros();
+        let mut warp_point = SMatrix::<f64, WARP, 3>::zeros();
+        let mut warp_warp = SMatrix::<f64, WARP, WARP>::zeros();
+        let mut warp_gradient = SVector::<f64, WARP>::zeros();
         let mut cost = 0.0;
         let first_cross = self.crosses.len();
         let mut anchor_by_point = SMatrix::<f64, 6, 3>::zeros();
-        self.touched.clear();
         let mut sights = 0;
         for observation in &landmark.observations {
             if Some(observation.serial) == without {
@@ -135,7 +166,8 @@ impl System {
                 continue;
             };
             if line.linearised.is_some() {
-                let Some(px) = sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
+                let Some(px) =
+                    sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
                 else {
                     continue;
                 };
@@ -143,7 +175,7 @@ impl System {
             }
             sights += 1;
             let (info, residual, loss) = weigh(
-                &(observation.measurement.px - seen.px),
+                &(warp.corrected(&observation.measurement).px - seen.px),
                 &observation.measurement.sigma_px,
                 variance_factor,
             );
@@ -151,11 +183,18 @@ impl System {
             let weighted = seen.by_point.transpose() * info;
             point_point += weighted * seen.by_point;
             point_gradient += weighted * residual;
+            let by_warp = warp.derivative(&observation.measurement);
+            let right = info.fixed_view::<2, 2>(2, 2);
+            let warp_weighted = by_warp.transpose() * right;
+            warp_warp += warp_weighted * by_warp;
+            warp_point += warp_weighted * seen.by_point.fixed_rows::<2>(2);
+            warp_gradient += warp_weighted * residual.fixed_rows::<2>(2);
             if frame == anchor {
                 continue;
             }
             let weighted = seen.by_motion.transpose() * info;
             line.information += weighted * seen.by_motion;
+            line.by_warp += weighted.fixed_columns::<2>(2) * by_warp;
             line.gradient += weighted * residual;
             line.is_used = true;
             let by_point = weighted * seen.by_point;
@@ -179,6 +218,7 @@ impl System {
             let a = &self.crosses[i];
             let gain = a.by_point * cov;
             self.gradients[a.frame] -= gain * point_gradient;
+            self.by_warp[a.frame] -= gain * warp_point.transpose();
             for b in &self.crosses[crosses.clone()] {
                 if a.frame <= b.frame {
                     self.blocks[a.frame * self.frame_count + b.frame] -=
@@ -186,11 +226,15 @@ impl System {
                 }
             }
         }
+        let gain = warp_point * cov;
+        self.warp_warp += warp_warp - gain * warp_point.transpose();
+        self.warp_gradient += warp_gradient - gain * point_gradient;
         self.reduced.push(Reduced {
             landmark: index,
             crosses,
             cov,
             gradient: point_gradient,
+            by_warp: warp_point,
         });
         Some(cost)
     }
@@ -213,23 +257,39 @@ impl System {
                     (frame, anchor, by_anchor)
                 };
                 self.blocks[row * n + column] -= block;
+                self.by_warp[frame] += line.by_warp;
+                self.by_warp[anchor] -= line.adjoint.transpose() * line.by_warp;
                 self.gradients[frame] += line.gradient;
                 self.gradients[anchor] -= line.adjoint.transpose() * line.gradient;
             }
         }
     }
 
-    /// The equations of all poses but the datum: full symmetric matrix and right side.
+    /// The equations of the warp and of all poses but the datum: full symmetric
+    /// matrix and right side.
     pub(super) fn assemble(&self) -> (DMatrix<f64>, DVector<f64>) {
         let n = self.frame_count;
-        let dim = 6 * n.saturating_sub(1);
+        let dim = row_of(n);
         let mut hessian = DMatrix::zeros(dim, dim);
         let mut gradient = DVector::zeros(dim);
+        hessian
+            .fixed_view_mut::<WARP, WARP>(0, 0)
+            .copy_from(&self.warp_warp);
+        gradient
+            .fixed_rows_mut::<WARP>(0)
+            .copy_from(&self.warp_gradient);
         for i in 1..n {
-            let r = 6 * (i - 1);
-            gradient.fixed_rows_mut::<6>(r).copy_from(&self.gradients[i]);
+            let r = row_of(i);
+            gradient
+                .fixed_rows_mut::<6>(r)
+                .copy_from(&self.gradients[i]);
+            let by_warp = &self.by_warp[i];
+            hessian.fixed_view_mut::<6, WARP>(r, 0).copy_from(by_warp);
+            hessian
+                .fixed_view_mut::<WARP, 6>(0, r)
+                .copy_from(&by_warp.transpose());
             for j in i..n {
-                let c = 6 * (j - 1);
+                let c = row_of(j);
                 let block = &self.blocks[i * n + j];
                 hessian.fixed_view_mut::<6, 6>(r, c).copy_from(block);
                 if i != j {
@@ -242,14 +302,13 @@ impl System {
         (hessian, gradient)
     }
 
-    /// Moves the landmarks along with a step of the poses (all but the datum), and notes their
-    /// covariance.
+    /// Moves the landmarks along with a step of warp and poses, and notes their covariance.
     pub(super) fn move_landmarks(&self, step: &DVector<f64>, landmarks: &mut [Landmark]) {
         for r in &self.reduced {
-            let mut gradient = r.gradient;
+            let mut gradient = r.gradient - r.by_warp.transpose() * step.fixed_rows::<WARP>(0);
             for cross in &self.crosses[r.crosses.clone()] {
                 if cross.frame > 0 {
-                    let x = step.fixed_rows::<6>(6 * (cross.frame - 1));
+                    let x = step.fixed_rows::<6>(row_of(cross.frame));
                     gradient -= cross.by_point.transpose() * x;
                 }
             }
@@ -279,5 +338,3 @@ fn weigh(
         variance_factor * (huber_loss(left) + huber_loss(right)),
     )
 }
-
-const _: () = assert!(MAX_FRAMES >= 3);
