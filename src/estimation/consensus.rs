@@ -54,6 +54,8 @@ pub struct Sighting {
     pub cov: Matrix3<f64>,
     /// Where it is seen now.
     pub now: StereoMeasurement,
+    /// How much its agreement counts.
+    pub weight: f64,
 }
 
 impl Sighting {
@@ -70,6 +72,7 @@ impl Sighting {
                 .cholesky()?
                 .inverse(),
             now: p.now,
+            weight: 1.0,
         })
     }
 }
@@ -146,6 +149,7 @@ struct Candidate {
     euclidean: Option<(Point3<f64>, Point3<f64>)>,
     /// Inverse of the covariance predicted for the residual of the present measurement.
     info: Matrix4<f64>,
+    weight: f64,
 }
 
 impl Candidate {
@@ -165,6 +169,7 @@ impl Candidate {
             inverse_depth: p.inverse_depth,
             euclidean,
             info,
+            weight: p.weight,
         }
     }
 
@@ -260,7 +265,7 @@ fn step<'a>(
 struct Best {
     motion: Option<Isometry3<f64>>,
     score: f64,
-    agreeing: usize,
+    agreeing: f64,
 }
 
 impl Best {
@@ -272,15 +277,17 @@ impl Best {
         gate: f64,
     ) {
         let mut score = 0.0;
-        let mut agreeing = 0;
-        for (done, c) in candidates.iter().enumerate() {
+        let mut agreeing = 0.0;
+        let mut ahead: f64 = candidates.iter().map(|c| c.weight).sum();
+        for c in candidates {
+            ahead -= c.weight;
             let gain = gate - c.squared_sigmas(rig, motion);
             if gain > 0.0 {
-                score += gain / gate;
-                agreeing += 1;
+                score += c.weight * gain / gate;
+                agreeing += 1.0;
             }
             // Even full marks for the rest would not win.
-            if score + ((candidates.len() - done) as f64) < self.score {
+            if score + ahead < self.score {
                 return;
             }
         }
@@ -295,7 +302,7 @@ impl Best {
 
     /// How many samples make it sure enough that one was free of outliers.
     fn samples_needed(&self, total: usize) -> u32 {
-        let share = self.agreeing as f64 / total.max(1) as f64;
+        let share = self.agreeing / total.max(1) as f64;
         let good = share.powi(3);
         if good >= 1.0 {
             return MIN_SAMPLES;

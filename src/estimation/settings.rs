@@ -39,6 +39,8 @@ pub struct Settings {
     pub seed: u64,
     /// Keyframes in the window. 2 to 12, default 7: more costs time and gains little.
     pub keyframes: u32,
+    /// Landmarks that are tracked at once. 20 to 5000, default 300: more cost time and gain little.
+    pub max_landmarks: u32,
     /// A pair becomes a keyframe when fewer of the last keyframe's landmarks are still seen. Share,
     /// 0 to 1, default 0.7.
     pub keyframe_survival: f64,
@@ -71,6 +73,7 @@ impl Default for Settings {
             seed: 1,
             keyframes: 7,
             calibration_sigma_px: 0.3,
+            max_landmarks: 300,
             keyframe_survival: 0.7,
             keyframe_parallax: 0.015,
             max_bridged: 20,
@@ -91,6 +94,7 @@ impl Settings {
         SettingError::unless_in("max_samples", self.max_samples, 10..=100_000)?;
         SettingError::unless_in("gate_sigma2", self.gate_sigma2, 1.0..=100.0)?;
         SettingError::unless_in("keyframes", self.keyframes, 2..=12)?;
+        SettingError::unless_in("max_landmarks", self.max_landmarks, 20..=5000)?;
         SettingError::unless_in("keyframe_survival", self.keyframe_survival, 0.0..=1.0)?;
         SettingError::unless_in("keyframe_parallax", self.keyframe_parallax, 0.0..=1.0)?;
         SettingError::unless_in(

@@ -21,6 +21,11 @@ pub(super) struct Portrait {
     pub(super) size_px: f64,
     /// Pairs in a row in which it should have been seen and was not.
     pub(super) missed: u32,
+    /// Whether the present pair shows it.
+    pub(super) found: bool,
+    /// Whether it was recognised where the others' motion does not put it: it moves by itself, or
+    /// was mistaken.
+    pub(super) disagreed: bool,
 }
 
 /// All landmarks under way, with rising ids.

@@ -3,6 +3,7 @@
 mod driver;
 mod gallery;
 mod method;
+mod occupancy;
 mod statistics;
 mod two_frame;
 mod windowed;

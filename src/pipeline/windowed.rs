@@ -4,8 +4,9 @@
 
 use super::gallery::{Gallery, Portrait};
 use super::method::Workbench;
-use crate::estimation::window::{self, Window};
-use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings};
+use super::occupancy::Occupancy;
+use crate::estimation::window::{self, Consent, Window};
+use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings, StereoMeasurement};
 use crate::geometry::StereoRig;
 use crate::matching::MatchError;
 use crate::refinement::{self, Appearance, Pyramid};
@@ -14,10 +15,14 @@ use std::time::Instant;
 
 /// How far a patch may be from where the motion puts it, px.
 const REACH_PX: f64 = 4.0;
+/// How far from the detector's position the patch of a landmark may be, px.
+const TRACK_REACH_PX: f64 = 4.0;
 /// How far from the detector's position a new landmark's patch may be on the right, px.
 const RIGHT_REACH_PX: f64 = 3.0;
 /// Pairs in a row in which a landmark may be missed before it is given up.
 const MAX_MISSED: u32 = 2;
+/// New landmarks in a cell of the image at most, old ones included.
+const MOST_IN_A_CELL: u32 = 8;
 /// Sights that may prove wrong before a landmark is given up.
 const MAX_WRONG: u32 = 1;
 
@@ -29,8 +34,13 @@ pub(super) struct Windowed {
     images: Vec<(u64, Pyramid)>,
     next_id: u64,
     seen: Vec<window::Seen>,
+    weights: Vec<f64>,
+    /// The tracks that `seen` comes from.
+    matches: Vec<usize>,
     /// Whether a stereo match of the present pair shows a landmark that is known.
     is_known: Vec<bool>,
+    occupancy: Occupancy,
+    candidates: Vec<usize>,
 }
 
 impl Windowed {
@@ -41,7 +51,11 @@ impl Windowed {
             images: Vec::new(),
             next_id: 0,
             seen: Vec::new(),
+            weights: Vec::new(),
+            matches: Vec::new(),
             is_known: Vec::new(),
+            occupancy: Occupancy::default(),
+            candidates: Vec::new(),
         }
     }
 
@@ -74,7 +88,7 @@ impl Windowed {
     ) -> Odometry {
         let consent = self.consent(bench, predicted, stamp.sequence);
         let tracked = consent.and_then(|newest_from_now| {
-            self.refine(bench, &newest_from_now);
+            self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());
             self.window.add(&newest_from_now, &self.seen);
             self.window.adjust()
@@ -169,7 +183,9 @@ impl Windowed {
             }));
     }
 
-    /// The motion that the recognised landmarks agree on.
+    /// Seeks the patch of every recognised landmark near where the detector saw it, and finds the
+    /// motion that they agree on: a patch's place is so sure that what moves by itself stands out.
+    /// Each part of the image has one vote, or a body of rich texture would outvote the world.
     fn consent(
         &mut self,
         bench: &mut Workbench,
@@ -177,63 +193,121 @@ impl Windowed {
         sequence: u64,
     ) -> Option<Isometry3<f64>> {
         self.seen.clear();
-        self.seen.extend(bench.tracks.iter().map(|t| window::Seen {
-            id: self.gallery.portraits[t.before as usize].id,
-            measurement: bench.now.measurements[t.now as usize],
-        }));
-        let seed = bench.estimation.seed ^ sequence;
-        let consent = self.window.consent(&self.seen, predicted, seed)?;
-        self.is_known.clear();
-        self.is_known.resize(bench.now.matches.len(), false);
-        for &i in &consent.inliers {
-            let track = bench.tracks[i as usize];
-            self.is_known[track.now as usize] = true;
-            let (pair, m) = (&bench.now.pair, bench.now.matches[track.now as usize]);
-            self.gallery.recognised(track.before as usize, pair, m);
+        self.matches.clear();
+        self.occupancy.begin(&bench.rig.left);
+        let now_from_newest = predicted.inverse();
+        for i in 0..bench.tracks.len() {
+            let track = bench.tracks[i];
+            let start = bench.now.measurements[track.now as usize].px;
+            let gallery_index = track.before as usize;
+            let Some(measurement) = self.seek(
+                bench,
+                gallery_index,
+                &now_from_newest,
+                &start,
+                TRACK_REACH_PX,
+            ) else {
+                continue;
+            };
+            self.occupancy.enter(&measurement.left_px());
+            self.matches.push(i);
+            self.seen.push(window::Seen {
+                id: self.gallery.portraits[gallery_index].id,
+                measurement,
+            });
         }
+        self.weights.clear();
+        let seen = self.seen.iter();
+        self.weights.extend(
+            seen.map(|s| 1.0 / f64::from(self.occupancy.count(&s.measurement.left_px()).max(1))),
+        );
+        let seed = bench.estimation.seed ^ sequence;
+        let consent = self
+            .window
+            .consent(&self.seen, &self.weights, predicted, seed)?;
+        self.take_note(bench, &consent);
         Some(consent.newest_from_now)
     }
 
-    /// Seeks every landmark of the gallery where the motion puts it; what was found is in `seen`.
-    fn refine(&mut self, bench: &mut Workbench, newest_from_now: &Isometry3<f64>) {
+    /// Takes note of who agrees with the motion and who does not; only the former stay in `seen`.
+    fn take_note(&mut self, bench: &Workbench, consent: &Consent) {
+        self.is_known.clear();
+        self.is_known.resize(bench.now.matches.len(), false);
+        for portrait in &mut self.gallery.portraits {
+            portrait.found = false;
+        }
+        for &i in &self.matches {
+            self.gallery.portraits[bench.tracks[i].before as usize].disagreed = true;
+        }
+        for (kept, &i) in consent.inliers.iter().enumerate() {
+            let track = bench.tracks[self.matches[i as usize]];
+            let portrait = &mut self.gallery.portraits[track.before as usize];
+            portrait.disagreed = false;
+            portrait.found = true;
+            self.is_known[track.now as usize] = true;
+            let (pair, m) = (&bench.now.pair, bench.now.matches[track.now as usize]);
+            self.gallery.recognised(track.before as usize, pair, m);
+            self.seen[kept] = self.seen[i as usize];
+        }
+        self.seen.truncate(consent.inliers.len());
+    }
+
+    /// Seeks the landmarks that the detector has missed where the motion puts them, and adds what
+    /// it finds to `seen`.
+    fn find_missed(&mut self, bench: &mut Workbench, newest_from_now: &Isometry3<f64>) {
         self.predict(bench, newest_from_now);
         let now_from_newest = newest_from_now.inverse();
-        let images = bench.now.pair.pyramids();
-        self.seen.clear();
-        for (portrait, predicted) in self.gallery.portraits.iter_mut().zip(&bench.predicted) {
-            let found = predicted
+        for i in 0..self.gallery.portraits.len() {
+            let portrait = &self.gallery.portraits[i];
+            if portrait.found || portrait.disagreed {
+                continue;
+            }
+            let id = portrait.id;
+            let found = bench.predicted[i]
                 .filter(|px| is_inside(&bench.rig, px))
-                .and_then(|start| {
-                    let landmark = self.window.landmark(portrait.id)?;
-                    let now_from_anchor =
-                        now_from_newest * self.window.newest_from_anchor(landmark)?;
-                    let (_, image) = self.images.iter().find(|(s, _)| *s == portrait.anchor)?;
-                    let appearance = Appearance {
-                        image,
-                        px: portrait.px,
-                        size_px: portrait.size_px,
-                    };
-                    refinement::refine(
-                        &bench.rig,
-                        &appearance,
-                        &landmark.inverse_depth,
-                        &now_from_anchor,
-                        &images,
-                        &start,
-                        REACH_PX,
-                    )
-                });
-            match found {
-                Some(measurement) => {
-                    portrait.missed = 0;
-                    self.seen.push(window::Seen {
-                        id: portrait.id,
-                        measurement,
-                    });
-                }
-                None => portrait.missed += 1,
+                .and_then(|start| self.seek(bench, i, &now_from_newest, &start, REACH_PX));
+            let portrait = &mut self.gallery.portraits[i];
+            portrait.found = found.is_some();
+            if let Some(measurement) = found {
+                self.seen.push(window::Seen { id, measurement });
             }
         }
+        for portrait in &mut self.gallery.portraits {
+            portrait.missed = if portrait.found {
+                0
+            } else {
+                portrait.missed + 1
+            };
+        }
+    }
+
+    /// Where a landmark's patch is in the present pair, near `start`.
+    fn seek(
+        &self,
+        bench: &Workbench,
+        index: usize,
+        now_from_newest: &Isometry3<f64>,
+        start: &Vector4<f64>,
+        reach_px: f64,
+    ) -> Option<StereoMeasurement> {
+        let portrait = &self.gallery.portraits[index];
+        let landmark = self.window.landmark(portrait.id)?;
+        let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
+        let (_, image) = self.images.iter().find(|(s, _)| *s == portrait.anchor)?;
+        let appearance = Appearance {
+            image,
+            px: portrait.px,
+            size_px: portrait.size_px,
+        };
+        refinement::refine(
+            &bench.rig,
+            &appearance,
+            &landmark.inverse_depth,
+            &now_from_anchor,
+            &bench.now.pair.pyramids(),
+            start,
+            reach_px,
+        )
     }
 
     /// Whether the window should keep the present pair.
@@ -263,54 +337,89 @@ impl Windowed {
             }
         }
         self.gallery.retain(|p| {
-            p.missed <= MAX_MISSED && window.landmark(p.id).is_some_and(|l| l.wrong <= MAX_WRONG)
+            p.missed <= MAX_MISSED
+                && !p.disagreed
+                && window.landmark(p.id).is_some_and(|l| l.wrong <= MAX_WRONG)
         });
         let mut image = self.release_image();
         std::mem::swap(&mut image, &mut bench.now.pair.left.pyramid);
         self.images.push((newest, image));
     }
 
-    /// The stereo matches of the present pair that show no known landmark become new ones: they are
-    /// left in `seen`.
+    /// Stereo matches of the present pair that show no known landmark become new ones, strong ones
+    /// first and where there are few as yet, until there are enough: they are left in `seen`.
     fn meet(&mut self, bench: &Workbench) {
         self.seen.clear();
-        let pair = &bench.now.pair;
-        let serial = self.window.newest_serial().unwrap_or(0);
-        for (i, known) in self.is_known.iter().enumerate() {
-            if *known {
-                continue;
+        self.occupancy.begin(&bench.rig.left);
+        let tracked = self.gallery.portraits.iter().filter(|p| p.missed == 0);
+        let mut room = bench.estimation.max_landmarks as usize;
+        for portrait in tracked {
+            if let Some(px) = self.window.newest_px(portrait.id) {
+                self.occupancy.enter(&px);
+                room = room.saturating_sub(1);
             }
-            let coarse = &bench.now.measurements[i];
-            let m = bench.now.matches[i];
-            let size_px = f64::from(pair.left.features.keypoints[m.left as usize].size_px);
-            let portrait = Portrait {
-                id: self.next_id,
-                anchor: serial,
-                px: coarse.left_px(),
-                size_px,
-                missed: 0,
-            };
-            let appearance = Appearance {
-                image: &pair.left.pyramid,
-                px: portrait.px,
-                size_px,
-            };
-            let Some(measurement) = refinement::refine_right(
-                &bench.rig,
-                &appearance,
-                &pair.right.pyramid,
-                coarse,
-                RIGHT_REACH_PX,
-            ) else {
-                continue;
-            };
-            self.next_id += 1;
-            self.seen.push(window::Seen {
-                id: portrait.id,
-                measurement,
-            });
-            self.gallery.add(portrait, pair, m);
         }
+        self.order_candidates(bench);
+        let candidates = std::mem::take(&mut self.candidates);
+        for most in 1..=MOST_IN_A_CELL {
+            for &i in &candidates {
+                if self.seen.len() >= room {
+                    break;
+                }
+                let px = bench.now.measurements[i].left_px();
+                if !self.is_known[i] && self.occupancy.count(&px) < most {
+                    self.is_known[i] = true;
+                    if self.meet_one(bench, i) {
+                        self.occupancy.enter(&px);
+                    }
+                }
+            }
+        }
+        self.candidates = candidates;
+    }
+
+    /// Stereo matches by the strength of their left keypoint.
+    fn order_candidates(&mut self, bench: &Workbench) {
+        let keypoints = &bench.now.pair.left.features.keypoints;
+        let response = |i: usize| keypoints[bench.now.matches[i].left as usize].response;
+        self.candidates.clear();
+        self.candidates.extend(0..bench.now.matches.len());
+        self.candidates
+            .sort_unstable_by(|&a, &b| response(b).total_cmp(&response(a)).then(a.cmp(&b)));
+    }
+
+    /// Makes one stereo match a new landmark, if its patch is found on the right.
+    fn meet_one(&mut self, bench: &Workbench, i: usize) -> bool {
+        let pair = &bench.now.pair;
+        let (coarse, m) = (&bench.now.measurements[i], bench.now.matches[i]);
+        let size_px = f64::from(pair.left.features.keypoints[m.left as usize].size_px);
+        let portrait = Portrait {
+            id: self.next_id,
+            anchor: self.window.newest_serial().unwrap_or(0),
+            px: coarse.left_px(),
+            size_px,
+            missed: 0,
+            found: true,
+            disagreed: false,
+        };
+        let appearance = Appearance {
+            image: &pair.left.pyramid,
+            px: portrait.px,
+            size_px,
+        };
+        let right = &pair.right.pyramid;
+        let found =
+            refinement::refine_right(&bench.rig, &appearance, right, coarse, RIGHT_REACH_PX);
+        let Some(measurement) = found else {
+            return false;
+        };
+        self.next_id += 1;
+        self.seen.push(window::Seen {
+            id: portrait.id,
+            measurement,
+        });
+        self.gallery.add(portrait, pair, m);
+        true
     }
 
     /// An image whose keyframe has left the window, to be used again.

@@ -34,7 +34,7 @@ use super::closed_form::MotionEstimate;
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
 use datum::Datum;
-use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector4};
+use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4};
 use prior::Prior;
 use system::System;
 use warp::{WARP, Warp};
@@ -81,6 +81,7 @@ pub struct Window {
     next_serial: u64,
     variance: VarianceFactor,
     system: System,
+    squares: Vec<f64>,
 }
 
 /// The a-posteriori variance factor, smoothed over frames.
@@ -125,6 +126,7 @@ impl Window {
                 frames: 0,
             },
             system: System::default(),
+            squares: Vec::new(),
         }
     }
 
@@ -169,6 +171,14 @@ impl Window {
     pub fn landmark(&self, id: LandmarkId) -> Option<&Landmark> {
         let at = self.landmarks.binary_search_by_key(&id, |l| l.id).ok()?;
         Some(&self.landmarks[at])
+    }
+
+    /// Where the newest frame sees a landmark in its left image, px; `None` if it does not.
+    #[must_use]
+    pub fn newest_px(&self, id: LandmarkId) -> Option<Vector2<f64>> {
+        let newest = self.newest_serial()?;
+        let last = self.landmark(id)?.observations.last()?;
+        (last.serial == newest).then(|| last.measurement.left_px())
     }
 
     /// The variance factor to expect of measurements.

@@ -24,6 +24,9 @@ const MAX_ITERATIONS: usize = 12;
 /// The gain in cost, σ², that a step must promise to be worth taking: a hundredth of the σ of any
 /// pose.
 const MIN_GAIN: f64 = 1e-4;
+/// The largest squared residual that counts, over the median one: beyond it lie 0.2 % of Gaussian
+/// ones (χ² with four degrees of freedom: 16.9 over 3.36).
+const LARGEST_OVER_MEDIAN: f64 = 5.0;
 /// Rounds of adjusting and judging the newest frame's sights.
 const ROUNDS: usize = 3;
 
@@ -45,15 +48,21 @@ impl Window {
         });
     }
 
-    /// The motion that most of `seen`, sights of known landmarks, agree on; `guess` is where to look
-    /// first. Changes nothing. `None` if fewer agree than the settings ask for.
+    /// The motion that most of `seen`, sights of known landmarks, agree on, each with its weight;
+    /// `guess` is where to look first. Changes nothing. `None` if fewer agree than the settings ask for.
     #[must_use]
-    pub fn consent(&self, seen: &[Seen], guess: &Isometry3<f64>, seed: u64) -> Option<Consent> {
+    pub fn consent(
+        &self,
+        seen: &[Seen],
+        weights: &[f64],
+        guess: &Isometry3<f64>,
+        seed: u64,
+    ) -> Option<Consent> {
         let newest = self.frames.last()?;
         let scale = 1.0 / self.variance.smoothed;
         let mut indices = Vec::with_capacity(seen.len());
         let mut sightings = Vec::with_capacity(seen.len());
-        for (i, s) in (0..).zip(seen) {
+        for ((i, s), &weight) in (0..).zip(seen).zip(weights) {
             let sighting = self.landmark(s.id).and_then(|landmark| {
                 let anchor = &self.frames[self.frame_index(landmark.anchor)?];
                 let newest_from_anchor =
@@ -63,6 +72,7 @@ impl Window {
                     inverse_depth,
                     cov: cov * scale,
                     now: self.warp.corrected(&s.measurement),
+                    weight,
                 })
             });
             if let Some(sighting) = sighting {
@@ -288,13 +298,14 @@ impl Window {
 
     /// Squared residuals of all that the newest frame's landmarks were seen as, over their degrees
     /// of freedom: four coordinates a sight, less three unknowns a landmark, less six for each
-    /// frame's pose, in the share of its sights that count here. Large residuals count as Huber
-    /// weighs them.
-    fn measure_variance(&self) -> Option<f64> {
+    /// frame's pose, in the share of its sights that count here. Large ones, compared with the
+    /// median, count no more than a Gaussian's largest.
+    fn measure_variance(&mut self) -> Option<f64> {
         let newest = self.newest_serial()?;
-        let limit = 2.0 * 9.0 * self.variance.smoothed;
-        let (mut sum, mut freedom) = (0.0, 0.0);
+        let mut freedom = 0.0;
         let mut counted = [[0_u32; 2]; MAX_FRAMES];
+        let mut squares = std::mem::take(&mut self.squares);
+        squares.clear();
         for (i, landmark) in self.landmarks.iter().enumerate() {
             let counts = landmark.last_seen() == newest && landmark.observations.len() > 1;
             for o in &landmark.observations {
@@ -303,7 +314,7 @@ impl Window {
                     counted[frame][0] += u32::from(counts);
                 }
                 if let Some(e) = self.squared_sigmas(i, o.serial).filter(|_| counts) {
-                    sum += if e <= limit { e } else { (limit * e).sqrt() };
+                    squares.push(e);
                     freedom += 4.0;
                 }
             }
@@ -314,7 +325,15 @@ impl Window {
         for [here, all] in &counted[1..] {
             freedom -= 6.0 * f64::from(*here) / f64::from((*all).max(1));
         }
-        (freedom > 0.0).then(|| sum / freedom)
+        if freedom <= 0.0 {
+            return None;
+        }
+        let middle = squares.len() / 2;
+        let median = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
+        let limit = LARGEST_OVER_MEDIAN * median;
+        let sum: f64 = squares.iter().map(|e| e.min(limit)).sum();
+        self.squares = squares;
+        Some(sum / freedom)
     }
 
     fn tracked(&self, joint: &Joint, variance_factor: f64, inliers: u32) -> Tracked {

@@ -61,7 +61,9 @@ fn drive(steps: usize, survival: f64, seed: u64) -> Run {
         } else {
             let (known, new): (Vec<Seen>, Vec<Seen>) =
                 sights.iter().partition(|s| window.landmark(s.id).is_some());
-            let consent = window.consent(&known, &step, k as u64).expect("agrees");
+            let consent = window
+                .consent(&known, &vec![1.0; known.len()], &step, k as u64)
+                .expect("agrees");
             let agreed: Vec<Seen> = consent.inliers.iter().map(|&i| known[i as usize]).collect();
             window.add(&consent.newest_from_now, &agreed);
             let tracked = window.adjust().expect("determined");
