@@ -3,12 +3,18 @@
 pub mod bundle;
 pub mod closed_form;
 pub mod consensus;
+pub mod influence;
+mod model;
 mod motion;
 mod odometer;
+pub mod planar;
 mod settings;
 mod sight;
 mod triangulation;
+pub mod two_frame;
+pub mod weighted;
 
+pub use model::{Model, MotionModel, Plane};
 pub use motion::{MeasuredMotion, measure};
 pub use odometer::{Odometer, PairStamp};
 pub use settings::{Method, Settings};

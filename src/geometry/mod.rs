@@ -14,6 +14,7 @@ mod plausibility;
 mod rectification;
 mod rig;
 mod rig_file;
+pub mod se2;
 pub mod se3;
 pub mod so3;
 
