@@ -8,6 +8,7 @@ mod model;
 mod motion;
 mod odometer;
 pub mod planar;
+pub mod reprojection;
 mod settings;
 mod sight;
 mod triangulation;

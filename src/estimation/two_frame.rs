@@ -1,10 +1,11 @@
 //! The tracks between two pairs in; the motion by any of the estimators on offer out, with what its
 //! error owes to each pixel.
 
-use super::bundle::{self, Adjuster, Adjustment, TrackedPoint};
+use super::bundle::TrackedPoint;
 use super::closed_form::{self, MotionEstimate};
 use super::influence::{self, Influence, Triangulated};
 use super::model::Model;
+use super::reprojection::{Adjusted, Reprojection};
 use super::{planar, weighted};
 use crate::geometry::StereoRig;
 use nalgebra::Isometry3;
@@ -46,7 +47,7 @@ pub struct TwoFrame {
     model: Model,
     /// Largest squared residual of a track that counts, σ².
     gate_sigma2: f64,
-    adjuster: Adjuster,
+    adjuster: Reprojection,
     kept: Vec<TrackedPoint>,
 }
 
@@ -59,7 +60,7 @@ impl TwoFrame {
             estimator,
             model,
             gate_sigma2,
-            adjuster: Adjuster::default(),
+            adjuster: Reprojection::default(),
             kept: Vec::new(),
         }
     }
@@ -85,10 +86,11 @@ impl TwoFrame {
         let mut influences = Vec::with_capacity(tracks.len());
         let estimate = match self.estimator {
             Estimator::Bundle => {
-                let motion = adjusted.motion.prev_from_now;
-                let model = &self.model;
-                influence::of_bundle(rig, model, &motion, &self.kept, &mut influences)?;
-                adjusted.motion
+                influences.extend(self.adjuster.influences(&adjusted.cov_right));
+                MotionEstimate {
+                    prev_from_now: adjusted.prev_from_now,
+                    cov_right: adjusted.cov_right,
+                }
             }
             Estimator::Svd | Estimator::Weighted => {
                 self.on_triangulated(rig, &mut tracks, &mut influences)?
@@ -115,11 +117,7 @@ impl TwoFrame {
             .map(|p| Triangulated::new(rig, p))
             .collect();
         retain_by(tracks, |i| points[i].is_some());
-        let mut i = 0;
-        self.kept.retain(|_| {
-            i += 1;
-            points[i - 1].is_some()
-        });
+        retain_by(&mut self.kept, |i| points[i].is_some());
         let points: Vec<Triangulated> = points.into_iter().flatten().collect();
         let model = &self.model;
         let prev_from_now = if self.estimator == Estimator::Svd {
@@ -148,42 +146,30 @@ impl TwoFrame {
         rig: &StereoRig,
         guess: &Isometry3<f64>,
         tracks: &mut Vec<u32>,
-    ) -> Option<Adjustment> {
+    ) -> Option<Adjusted> {
         let mut adjusted = self.adjust(rig, guess)?;
         for _ in 1..ROUNDS {
             let limit = self.gate_sigma2 * adjusted.variance_factor;
-            let motion = adjusted.motion.prev_from_now;
-            let agrees: Vec<bool> = self
-                .kept
-                .iter()
-                .map(|p| {
-                    bundle::squared_residual_sigmas(rig, &motion, p).is_some_and(|e| e <= limit)
-                })
-                .collect();
+            let residuals = self.adjuster.squared_residuals();
+            let agrees: Vec<bool> = residuals.map(|squares| squares <= limit).collect();
             if agrees.iter().all(|&yes| yes) {
                 break;
             }
             retain_by(tracks, |i| agrees[i]);
-            let mut i = 0;
-            self.kept.retain(|_| {
-                i += 1;
-                agrees[i - 1]
-            });
-            adjusted = self.adjust(rig, &motion)?;
+            retain_by(&mut self.kept, |i| agrees[i]);
+            adjusted = self.adjust(rig, &adjusted.prev_from_now)?;
         }
         Some(adjusted)
     }
 
-    fn adjust(&mut self, rig: &StereoRig, start: &Isometry3<f64>) -> Option<Adjustment> {
-        match &self.model {
-            Model::Se3 => self.adjuster.adjust(rig, start, &mut self.kept),
-            model @ Model::Planar(_) => planar::adjust(rig, model, start, &mut self.kept),
-        }
+    fn adjust(&mut self, rig: &StereoRig, start: &Isometry3<f64>) -> Option<Adjusted> {
+        self.adjuster
+            .adjust(rig, &self.model, start, &mut self.kept)
     }
 }
 
 /// Keeps the elements whose place satisfies `keep`.
-fn retain_by(items: &mut Vec<u32>, keep: impl Fn(usize) -> bool) {
+fn retain_by<T>(items: &mut Vec<T>, keep: impl Fn(usize) -> bool) {
     let mut place = 0;
     items.retain(|_| {
         place += 1;

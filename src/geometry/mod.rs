@@ -11,6 +11,7 @@
 mod camera;
 mod distortion;
 mod plausibility;
+pub(crate) mod product;
 mod rectification;
 mod rig;
 mod rig_file;
