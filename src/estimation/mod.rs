@@ -1,6 +1,7 @@
 //! Estimation: matched features in, motion and pose with covariance out.
 
 pub mod bundle;
+pub mod calibration;
 pub mod closed_form;
 pub mod consensus;
 pub mod influence;

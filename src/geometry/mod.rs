@@ -15,6 +15,7 @@ pub(crate) mod product;
 mod rectification;
 mod rig;
 mod rig_file;
+pub mod rig_parameters;
 pub mod se2;
 pub mod se3;
 pub mod so3;

@@ -4,10 +4,12 @@ use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::influence::Influence;
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
-use crate::estimation::{Model, inverse_depth};
+use crate::estimation::{Model, calibration, inverse_depth};
 use crate::geometry::StereoRig;
+use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
 use crate::uncertainty::compounding;
-use nalgebra::{Isometry3, Matrix6, Vector3, Vector4};
+use crate::uncertainty::consider::Sensitivity;
+use nalgebra::{Isometry3, Matrix6, Vector3, Vector4, Vector6};
 
 /// The odometry of the thesis with any of its estimators: each motion from two pairs, poses by
 /// chaining.
@@ -15,11 +17,22 @@ pub struct TwoFrameChain<'a> {
     rig: &'a StereoRig,
     two_frame: TwoFrame,
     cross_terms: bool,
+    considered: Option<Box<RigCovariance>>,
     before: Vec<(TrackedSight, Option<Vector3<f64>>)>,
-    place: Option<FrameEstimate>,
+    place: Option<Place>,
     last: Option<LastMotion>,
     ids: Vec<u64>,
     points: Vec<TrackedPoint>,
+}
+
+/// Where the chain has come to.
+#[derive(Clone, Copy)]
+struct Place {
+    prev_from_now: Isometry3<f64>,
+    odom_from_camera: Isometry3<f64>,
+    /// Covariance of the pose from the pixels' noise alone.
+    measurement: Matrix6<f64>,
+    by_rig: Sensitivity<RIG_PARAMETERS>,
 }
 
 /// What the last motion owes to the pixels of its present view.
@@ -44,12 +57,20 @@ impl<'a> TwoFrameChain<'a> {
             rig,
             two_frame: TwoFrame::new(estimator, model, gate_sigma2),
             cross_terms,
+            considered: None,
             before: Vec::new(),
             place: None,
             last: None,
             ids: Vec::new(),
             points: Vec::new(),
         }
+    }
+
+    /// The same chain, its covariances accounting for an uncertain rig (theory §5).
+    #[must_use]
+    pub fn considering(mut self, covariance: RigCovariance) -> Self {
+        self.considered = Some(Box::new(covariance));
+        self
     }
 
     /// Tracks from the pair before to this one.
@@ -90,12 +111,41 @@ impl<'a> TwoFrameChain<'a> {
         cross * (last.variance_factor * motion.variance_factor).sqrt()
     }
 
-    fn advance(&mut self, place: &FrameEstimate, motion: &TwoFrameMotion) -> FrameEstimate {
+    /// The derivative of a motion by the rig's parameters, where the rig is uncertain at all.
+    fn by_rig(&self, motion: &TwoFrameMotion) -> Option<Sensitivity<RIG_PARAMETERS>> {
+        if self.considered.is_none() {
+            return Some(Sensitivity::default());
+        }
+        let tracks = motion.tracks.iter().map(|&i| &self.points[i as usize]);
+        let at_rest = Vector6::zeros();
+        let sensitivity = calibration::of_motion(
+            self.rig,
+            &motion.estimate.prev_from_now,
+            tracks.zip(&motion.influences),
+            &at_rest,
+            &at_rest,
+        )?;
+        Some(sensitivity.by_rig)
+    }
+
+    fn advance(&mut self, place: &Place, motion: &TwoFrameMotion) -> Option<FrameEstimate> {
         let prev_from_now = motion.estimate.prev_from_now;
         let cov_motion = motion.estimate.cov_right * motion.variance_factor;
         let cross = self.covariance_with_last(motion);
         let mut odom_from_camera = place.odom_from_camera * prev_from_now;
         odom_from_camera.rotation.renormalize();
+        let by_rig = self.by_rig(motion)?;
+        let next = Place {
+            prev_from_now,
+            odom_from_camera,
+            measurement: compounding::chain_correlated(
+                &place.measurement,
+                &prev_from_now,
+                &cov_motion,
+                &cross,
+            ),
+            by_rig: place.by_rig.chain(&prev_from_now, &by_rig),
+        };
         let tracks = motion.tracks.iter().zip(&motion.influences);
         self.last = Some(LastMotion {
             tracks: tracks
@@ -106,16 +156,33 @@ impl<'a> TwoFrameChain<'a> {
                 .collect(),
             variance_factor: motion.variance_factor,
         });
-        FrameEstimate {
+        self.place = Some(next);
+        let calibration = |by: &Sensitivity<RIG_PARAMETERS>| {
+            let considered = self.considered.as_ref();
+            considered.map_or_else(Matrix6::zeros, |covariance| by.covariance(covariance))
+        };
+        Some(FrameEstimate {
             prev_from_now,
-            cov_motion,
+            cov_motion: cov_motion + calibration(&by_rig),
             odom_from_camera,
-            cov_pose: compounding::chain_correlated(
-                &place.cov_pose,
-                &prev_from_now,
-                &cov_motion,
-                &cross,
-            ),
+            cov_pose: next.measurement + calibration(&next.by_rig),
+        })
+    }
+
+    /// The first pair: the origin.
+    fn begin(&mut self) -> FrameEstimate {
+        let identity = Isometry3::identity();
+        self.place = Some(Place {
+            prev_from_now: identity,
+            odom_from_camera: identity,
+            measurement: Matrix6::zeros(),
+            by_rig: Sensitivity::default(),
+        });
+        FrameEstimate {
+            prev_from_now: identity,
+            cov_motion: Matrix6::zeros(),
+            odom_from_camera: identity,
+            cov_pose: Matrix6::zeros(),
         }
     }
 }
@@ -123,18 +190,13 @@ impl<'a> TwoFrameChain<'a> {
 impl FrameEstimator for TwoFrameChain<'_> {
     fn observe(&mut self, sights: &[TrackedSight]) -> Option<FrameEstimate> {
         let estimate = match self.place {
-            None => FrameEstimate {
-                prev_from_now: Isometry3::identity(),
-                cov_motion: Matrix6::zeros(),
-                odom_from_camera: Isometry3::identity(),
-                cov_pose: Matrix6::zeros(),
-            },
+            None => self.begin(),
             Some(place) => {
                 self.find_tracks(sights);
                 // A robot goes on as it did.
                 let guess = place.prev_from_now;
                 let motion = self.two_frame.estimate(self.rig, &guess, &self.points)?;
-                self.advance(&place, &motion)
+                self.advance(&place, &motion)?
             }
         };
         self.before.clear();
@@ -143,7 +205,6 @@ impl FrameEstimator for TwoFrameChain<'_> {
                 .iter()
                 .map(|sight| (*sight, inverse_depth(self.rig, &sight.measurement))),
         );
-        self.place = Some(estimate);
         Some(estimate)
     }
 }

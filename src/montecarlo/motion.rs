@@ -1,9 +1,10 @@
 //! The second stage: points to one motion (thesis §3.3, figure 4.6).
 
 use super::verdict::{Tally, Verdict};
-use super::world::World;
+use super::world::{RigDraw, World};
 use super::{
-    FrameEstimator, MonteCarloError, Settings, TwoFrameChain, bound, for_each_run, rng_of_run,
+    FrameEstimator, MonteCarloError, RigError, Settings, TwoFrameChain, bound, for_each_run,
+    rng_of_run,
 };
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{Isometry3, Vector6};
@@ -33,6 +34,7 @@ pub fn run_motion(
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<MotionOutcome, MonteCarloError> {
     settings.check()?;
+    let rigs = RigDraw::new(rig, settings)?;
     let model = settings.model.of(rig);
     let world = World::new(
         rig,
@@ -48,7 +50,7 @@ pub fn run_motion(
         settings.runs,
         |run| {
             let mut rng = rng_of_run(settings.seed, STAGE, run);
-            let rig_seen = settings.rig_in_run(rig, &mut rng);
+            let rig_seen = rigs.as_ref().map(|rigs| rigs.draw(rig, &mut rng));
             let mut frames = Vec::new();
             world.measure(rig_seen.as_ref(), &mut rng, &mut frames);
             let mut chain = settings.chain(rig, model);
@@ -88,21 +90,18 @@ impl Settings {
         rig: &'a StereoRig,
         model: crate::estimation::Model,
     ) -> TwoFrameChain<'a> {
-        TwoFrameChain::new(
+        let chain = TwoFrameChain::new(
             rig,
             self.estimator,
             model,
             self.gate_sigma2,
             self.cross_terms,
-        )
-    }
-
-    /// The rig as it truly is in a run, where it is not what it is said to be.
-    pub(super) fn rig_in_run(
-        &self,
-        _rig: &StereoRig,
-        _rng: &mut rand_xoshiro::Xoshiro256PlusPlus,
-    ) -> Option<StereoRig> {
-        None
+        );
+        match rig.covariance() {
+            Some(covariance) if self.rig_error == RigError::Considered => {
+                chain.considering(covariance)
+            }
+            _ => chain,
+        }
     }
 }

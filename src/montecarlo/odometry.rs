@@ -1,7 +1,7 @@
 //! The third stage: motions to a path (thesis §3.4, figures 4.7 and 4.11).
 
 use super::verdict::{Tally, Verdict};
-use super::world::World;
+use super::world::{RigDraw, World};
 use super::{
     FrameEstimate, FrameEstimator, MonteCarloError, Settings, bound, for_each_run, rng_of_run,
 };
@@ -73,6 +73,7 @@ pub fn run_odometry_with<E: FrameEstimator>(
     begin: impl Fn() -> E + Sync,
 ) -> Result<OdometryOutcome, MonteCarloError> {
     settings.check()?;
+    let rigs = RigDraw::new(rig, settings)?;
     let model = settings.model.of(rig);
     let mut rng = rng_of_run(settings.seed, STAGE, u64::MAX);
     let world = World::new(rig, settings, settings.steps, &mut rng)?;
@@ -86,7 +87,7 @@ pub fn run_odometry_with<E: FrameEstimator>(
         settings.runs,
         |run| {
             let mut rng = rng_of_run(settings.seed, STAGE, run);
-            let rig_seen = settings.rig_in_run(rig, &mut rng);
+            let rig_seen = rigs.as_ref().map(|rigs| rigs.draw(rig, &mut rng));
             let mut frames = Vec::new();
             world.measure(rig_seen.as_ref(), &mut rng, &mut frames);
             let mut estimator = begin();

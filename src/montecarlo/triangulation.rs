@@ -1,11 +1,17 @@
 //! The first stage: pixels to points (thesis §3.2, figure 4.5).
 
 use super::verdict::{Tally, Verdict};
-use super::{MonteCarloError, Settings, for_each_run, rng_of_run};
-use crate::estimation::{MotionModel, Plane, StereoMeasurement, triangulate};
+use super::world::RigDraw;
+use super::{MonteCarloError, RigError, Settings, for_each_run, rng_of_run};
+use crate::estimation::{
+    Landmark, MotionModel, Plane, StereoMeasurement, calibration, triangulate,
+};
 use crate::geometry::StereoRig;
-use crate::uncertainty::consistency;
-use nalgebra::{Matrix2x3, Matrix3, Matrix6, Point3, Vector2, Vector3, Vector4, Vector6};
+use crate::geometry::rig_parameters::RigCovariance;
+use crate::uncertainty::{consistency, propagate};
+use nalgebra::{
+    Isometry3, Matrix2x3, Matrix3, Matrix4, Matrix6, Point3, Vector2, Vector3, Vector4, Vector6,
+};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// What the triangulation stage found of one point.
@@ -48,24 +54,32 @@ pub fn run_triangulation(
     progress: &(dyn Fn(u64) + Sync),
 ) -> Result<TriangulationOutcome, MonteCarloError> {
     settings.check()?;
+    let rigs = RigDraw::new(rig, settings)?;
     let truth = points(rig, settings)?;
     let plane = Plane::of(rig);
     let planar = settings.model == MotionModel::Planar;
     let freedom = if planar { 2 } else { 3 };
+    let considered = match settings.rig_error {
+        RigError::Considered => rig.covariance(),
+        _ => None,
+    };
     let mut tallies = vec![Tally::new(freedom); truth.len()];
     let mut samples = vec![Vec::new(); truth.len()];
     for_each_run(
         settings.runs,
         |run| {
             let mut rng = rng_of_run(settings.seed, STAGE, run);
-            let rig_seen = settings.rig_in_run(rig, &mut rng);
+            let rig_seen = rigs.as_ref().map(|rigs| rigs.draw(rig, &mut rng));
             let seen = rig_seen.as_ref().unwrap_or(rig);
             let measure = |p: &Point3<f64>, rng: &mut Xoshiro256PlusPlus| {
                 let m = StereoMeasurement {
                     px: seen.project(p)? + settings.noise.sample(rng).0,
                     sigma_px: Vector4::repeat(settings.stated_sigma_px()),
                 };
-                let landmark = triangulate(rig, &m)?;
+                let mut landmark = triangulate(rig, &m)?;
+                if let Some(covariance) = &considered {
+                    landmark.cov_m2 += of_calibration(rig, &m, &landmark, covariance)?;
+                }
                 let error = landmark.point - p;
                 let nees = nees(&plane, planar, &error, &landmark.cov_m2)?;
                 Some((landmark, error, nees))
@@ -108,6 +122,22 @@ pub fn run_triangulation(
         })
         .collect();
     Ok(TriangulationOutcome { points })
+}
+
+/// What the rig's uncertainty adds to a point's covariance: as a displacement of its pixels.
+fn of_calibration(
+    rig: &StereoRig,
+    m: &StereoMeasurement,
+    landmark: &Landmark,
+    covariance: &RigCovariance,
+) -> Option<Matrix3<f64>> {
+    let p = landmark.point;
+    let y = Vector3::new(p.x / p.z, p.y / p.z, 1.0 / p.z);
+    let by_rig = calibration::sight_by_rig(rig, &Isometry3::identity(), &y)?;
+    let (_, jacobian) = rig.project_with_jacobian(&p)?;
+    let info = Matrix4::from_diagonal(&m.sigma_px.map(|s| 1.0 / (s * s)));
+    let by_rig = landmark.cov_m2 * jacobian.transpose() * info * by_rig;
+    Some(propagate(&by_rig, covariance))
 }
 
 /// Over all three axes, or over the two of the ground.

@@ -1,11 +1,13 @@
 //! Landmarks along a path, drawn once; their noisy sights, run by run.
 
 use super::estimator::TrackedSight;
-use super::{MonteCarloError, Settings};
+use super::{MonteCarloError, RigError, Settings};
 use crate::estimation::{Plane, StereoMeasurement};
 use crate::geometry::StereoRig;
+use crate::geometry::rig_parameters::{RigCovariance, RigVector};
 use nalgebra::{Isometry2, Isometry3, Point3, Vector2, Vector4};
 use rand::RngExt;
+use rand_distr::StandardNormal;
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// A landmark as one pair truly sees it.
@@ -191,5 +193,34 @@ impl<'a> World<'a> {
             far_m: far.to_string(),
             when: "before and after a motion",
         })
+    }
+}
+
+/// Draws what a rig truly is, from the uncertainty that it states.
+pub(super) struct RigDraw {
+    /// A square root of the parameters' covariance, which may be singular.
+    root: RigCovariance,
+}
+
+impl RigDraw {
+    /// `None` where the rig is to be what it is said to be.
+    pub(super) fn new(
+        rig: &StereoRig,
+        settings: &Settings,
+    ) -> Result<Option<Self>, MonteCarloError> {
+        if settings.rig_error == RigError::None {
+            return Ok(None);
+        }
+        let covariance = rig.covariance().ok_or(MonteCarloError::NoRigUncertainty)?;
+        let eigen = covariance.symmetric_eigen();
+        let sigmas = eigen.eigenvalues.map(|variance| variance.max(0.0).sqrt());
+        let root = eigen.eigenvectors * RigCovariance::from_diagonal(&sigmas);
+        Ok(Some(Self { root }))
+    }
+
+    /// The rig of one run.
+    pub(super) fn draw(&self, rig: &StereoRig, rng: &mut Xoshiro256PlusPlus) -> StereoRig {
+        let unit = RigVector::from_fn(|_, _| rng.sample::<f64, _>(StandardNormal));
+        rig.with_error(&(self.root * unit))
     }
 }

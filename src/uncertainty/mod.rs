@@ -1,6 +1,7 @@
 //! Uncertainty: how an error travels, and how to tell whether a covariance holds.
 
 pub mod compounding;
+pub mod consider;
 pub mod consistency;
 mod implicit;
 
