@@ -5,8 +5,8 @@ use crate::estimation::MotionModel;
 use crate::estimation::two_frame::Estimator;
 use crate::geometry::{StereoRig, load_rig};
 use crate::montecarlo::{
-    MonteCarloError, Outcomes, RigError, Settings, run_motion, run_odometry, run_triangulation,
-    summary_text, write_csv,
+    MonteCarloError, Outcomes, RigError, Settings, figure_files, run_motion, run_odometry,
+    run_triangulation, summary_text, write_csv,
 };
 use crate::simulation::{points::PixelNoise, thesis_rig};
 use std::path::PathBuf;
@@ -149,6 +149,10 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         std::fs::create_dir_all(folder).map_err(|e| unwritable(folder, &e))?;
         let file = folder.join("montecarlo.csv");
         std::fs::write(&file, write_csv(&outcomes)).map_err(|e| unwritable(&file, &e))?;
+        for figure in figure_files(&outcomes, &settings) {
+            let file = folder.join(figure.name);
+            std::fs::write(&file, figure.content).map_err(|e| unwritable(&file, &e))?;
+        }
     }
     Ok(())
 }

@@ -19,9 +19,12 @@
 
 mod bound;
 mod chain;
+mod ellipse;
 pub mod estimator;
+mod figures;
 mod motion;
 mod odometry;
+mod page;
 mod settings;
 mod table;
 mod triangulation;
@@ -32,6 +35,7 @@ pub use chain::TwoFrameChain;
 pub use estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 pub use motion::{MotionOutcome, run_motion};
 pub use odometry::{OdometryOutcome, run_odometry, run_odometry_with};
+pub use page::{FigureFile, figure_files};
 pub use settings::{RigError, Settings};
 pub use table::{Outcomes, summary_text, write_csv};
 pub use triangulation::{PointOutcome, TriangulationOutcome, run_triangulation};
