@@ -5,8 +5,8 @@ use crate::estimation::MotionModel;
 use crate::estimation::two_frame::Estimator;
 use crate::geometry::{StereoRig, load_rig};
 use crate::montecarlo::{
-    MonteCarloError, Outcomes, RigError, Settings, figure_files, run_motion, run_odometry,
-    run_triangulation, summary_text, write_csv,
+    Correlation, MonteCarloError, Outcomes, RigError, Settings, figure_files, run_motion,
+    run_odometry, run_triangulation, summary_text, to_csv, to_json,
 };
 use crate::simulation::{points::PixelNoise, thesis_rig};
 use std::path::PathBuf;
@@ -93,9 +93,9 @@ pub(crate) struct Args {
     /// Draw an error of the rig in each run from the uncertainty that its file states.
     #[arg(long, value_enum, default_value_t = Settings::default().rig_error)]
     rig_error: RigError,
-    /// Take consecutive motions as independent, as the thesis does, though they share pixels.
-    #[arg(long)]
-    independent: bool,
+    /// What is assumed of consecutive motions, which share pixels.
+    #[arg(long, value_enum, default_value_t = Settings::default().correlation)]
+    correlation: Correlation,
     /// Threads [default: one a core].
     #[arg(long, value_name = "N")]
     threads: Option<usize>,
@@ -144,11 +144,15 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let outcomes = pool
         .install(|| run_stages(args, &rig, &settings))
         .map_err(failure)?;
-    print!("{}", summary_text(&outcomes));
+    if args.json {
+        println!("{}", to_json(&outcomes).map_err(Failure::other)?);
+    } else {
+        print!("{}", summary_text(&outcomes));
+    }
     if let Some(folder) = &args.output {
         std::fs::create_dir_all(folder).map_err(|e| unwritable(folder, &e))?;
         let file = folder.join("montecarlo.csv");
-        std::fs::write(&file, write_csv(&outcomes)).map_err(|e| unwritable(&file, &e))?;
+        std::fs::write(&file, to_csv(&outcomes)).map_err(|e| unwritable(&file, &e))?;
         for figure in figure_files(&outcomes, &settings) {
             let file = folder.join(figure.name);
             std::fs::write(&file, figure.content).map_err(|e| unwritable(&file, &e))?;
@@ -213,7 +217,7 @@ impl Args {
             persistence: self.persistence,
             stated_sigma_px: self.stated_sigma_px,
             rig_error: self.rig_error,
-            cross_terms: !self.independent,
+            correlation: self.correlation,
             ..Settings::default()
         };
         settings

@@ -12,6 +12,7 @@ pub mod planar;
 pub mod reprojection;
 mod settings;
 mod sight;
+pub mod track_noise;
 mod triangulation;
 pub mod two_frame;
 pub mod weighted;

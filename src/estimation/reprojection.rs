@@ -21,8 +21,12 @@ pub struct Adjusted {
     pub prev_from_now: Isometry3<f64>,
     /// Covariance of the right perturbation for a variance factor of 1.
     pub cov_right: Matrix6<f64>,
-    /// A-posteriori variance factor: weighted squared residuals over degrees of freedom.
+    /// A-posteriori variance factor: squared residuals over degrees of freedom. It is that of all
+    /// the tracks together, outliers included: judge those by `robust_factor` first.
     pub variance_factor: f64,
+    /// The same with outliers bounded by their robust weights. What scales a covariance must not
+    /// be: heavy tails are noise too, and robust weights then hide a tenth of it.
+    pub robust_factor: f64,
     /// Times that the tracks were linearised.
     pub iterations: usize,
 }
@@ -79,12 +83,13 @@ impl Reprojection {
             }
         }
         let (cov_right, _) = self.solve(model)?;
-        let freedom = 5 * points.len() - model.degrees_of_freedom();
-        let squares: f64 = self.tracks.iter().map(|t| t.weighted_squares).sum();
+        let freedom = (5 * points.len() - model.degrees_of_freedom()) as f64;
+        let sum = |of: fn(&TrackEquations) -> f64| self.tracks.iter().map(of).sum::<f64>();
         Some(Adjusted {
             prev_from_now: motion,
             cov_right,
-            variance_factor: squares / freedom as f64,
+            variance_factor: sum(|t| t.squares) / freedom,
+            robust_factor: sum(|t| t.weighted_squares) / freedom,
             iterations,
         })
     }

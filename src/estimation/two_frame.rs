@@ -29,8 +29,10 @@ pub enum Estimator {
 pub struct TwoFrameMotion {
     /// The motion, its covariance for a variance factor of 1.
     pub estimate: MotionEstimate,
-    /// A-posteriori variance factor of the residuals in the images.
+    /// A-posteriori variance factor of the residuals in the images at `reprojected`.
     pub variance_factor: f64,
+    /// The motion that reprojects the tracks best; the estimate itself for the bundle adjustment.
+    pub reprojected: Isometry3<f64>,
     /// Indices of the tracks that it rests on, ascending.
     pub tracks: Vec<u32>,
     /// What each of these tracks' pixels do to the motion, in the same order.
@@ -99,6 +101,7 @@ impl TwoFrame {
         Some(TwoFrameMotion {
             estimate,
             variance_factor: adjusted.variance_factor,
+            reprojected: adjusted.prev_from_now,
             tracks,
             influences,
         })
@@ -149,7 +152,7 @@ impl TwoFrame {
     ) -> Option<Adjusted> {
         let mut adjusted = self.adjust(rig, guess)?;
         for _ in 1..ROUNDS {
-            let limit = self.gate_sigma2 * adjusted.variance_factor;
+            let limit = self.gate_sigma2 * adjusted.robust_factor;
             let residuals = self.adjuster.squared_residuals();
             let agrees: Vec<bool> = residuals.map(|squares| squares <= limit).collect();
             if agrees.iter().all(|&yes| yes) {

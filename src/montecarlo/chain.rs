@@ -1,22 +1,25 @@
 //! Two-frame motions chained to a pose, with the correlation that shared pixels give them.
 
+use super::Correlation;
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::influence::Influence;
+use crate::estimation::track_noise::{self, TrackNoise, TrackNoiseMeter, TrackResidual};
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
 use crate::estimation::{Model, calibration, inverse_depth};
-use crate::geometry::StereoRig;
 use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
+use crate::geometry::{StereoRig, se3};
 use crate::uncertainty::compounding;
 use crate::uncertainty::consider::Sensitivity;
-use nalgebra::{Isometry3, Matrix6, Vector3, Vector4, Vector6};
+use nalgebra::{Isometry3, Matrix6, Vector3, Vector6};
 
 /// The odometry of the thesis with any of its estimators: each motion from two pairs, poses by
 /// chaining.
 pub struct TwoFrameChain<'a> {
     rig: &'a StereoRig,
     two_frame: TwoFrame,
-    cross_terms: bool,
+    correlation: Correlation,
+    meter: TrackNoiseMeter,
     considered: Option<Box<RigCovariance>>,
     before: Vec<(TrackedSight, Option<Vector3<f64>>)>,
     place: Option<Place>,
@@ -35,28 +38,34 @@ struct Place {
     by_rig: Sensitivity<RIG_PARAMETERS>,
 }
 
-/// What the last motion owes to the pixels of its present view.
+/// The tracks of the last motion, with rising ids.
 struct LastMotion {
-    /// Rising ids with their influence and the σ of the pixels.
-    tracks: Vec<(u64, Influence, Vector4<f64>)>,
+    tracks: Vec<LastTrack>,
     variance_factor: f64,
 }
 
+/// What a track's pixels, in units of their σ, did to the last motion, and what was left of them.
+struct LastTrack {
+    id: u64,
+    influence: Influence,
+    residual: Option<TrackResidual>,
+}
+
 impl<'a> TwoFrameChain<'a> {
-    /// A chain that begins with the next pair. Without `cross_terms`, motions are taken as
-    /// independent of each other, as the thesis does.
+    /// A chain that begins with the next pair.
     #[must_use]
     pub fn new(
         rig: &'a StereoRig,
         estimator: Estimator,
         model: Model,
         gate_sigma2: f64,
-        cross_terms: bool,
+        correlation: Correlation,
     ) -> Self {
         Self {
             rig,
             two_frame: TwoFrame::new(estimator, model, gate_sigma2),
-            cross_terms,
+            correlation,
+            meter: TrackNoiseMeter::new(&TrackNoise::of_detector(1.0)),
             considered: None,
             before: Vec::new(),
             place: None,
@@ -94,21 +103,69 @@ impl<'a> TwoFrameChain<'a> {
         }
     }
 
-    /// `Cov(δm_last, δm)`: from the pixels that both motions used (theory §4).
-    fn covariance_with_last(&self, motion: &TwoFrameMotion) -> Matrix6<f64> {
-        let Some(last) = self.last.as_ref().filter(|_| self.cross_terms) else {
-            return Matrix6::zeros();
-        };
-        let mut cross = Matrix6::zeros();
-        let mut earlier = last.tracks.iter().peekable();
-        for (track, influence) in motion.tracks.iter().zip(&motion.influences) {
-            let id = self.ids[*track as usize];
-            while earlier.next_if(|(other, ..)| *other < id).is_some() {}
-            if let Some((_, before, sigma_px)) = earlier.next_if(|(other, ..)| *other == id) {
-                cross += before.covariance_with_next(sigma_px, influence);
+    /// The tracks of a motion, whitened, with their residuals where these are to be measured.
+    fn tracks_of(&self, motion: &TwoFrameMotion) -> LastMotion {
+        let measured = self.correlation == Correlation::Measured;
+        let tracks = motion.tracks.iter().zip(&motion.influences);
+        let prev_from_now = motion.reprojected;
+        LastMotion {
+            tracks: tracks
+                .map(|(&i, influence)| {
+                    let point = &self.points[i as usize];
+                    let residual = measured
+                        .then(|| TrackResidual::new(self.rig, &prev_from_now, point))
+                        .flatten();
+                    LastTrack {
+                        id: self.ids[i as usize],
+                        influence: track_noise::whitened(influence, point),
+                        residual,
+                    }
+                })
+                .collect(),
+            variance_factor: motion.variance_factor,
+        }
+    }
+
+    /// Covariance of the motion, and `Cov(δm_last, δm)`: from the pixels that both motions used
+    /// (theory §4).
+    fn covariances(
+        &mut self,
+        motion: &TwoFrameMotion,
+        now: &LastMotion,
+    ) -> (Matrix6<f64>, Matrix6<f64>) {
+        let plain = motion.estimate.cov_right * motion.variance_factor;
+        match self.correlation {
+            Correlation::Independent => (plain, Matrix6::zeros()),
+            Correlation::Shared => {
+                let factor = self.last.as_ref().map_or(1.0, |last| last.variance_factor);
+                let factor = (factor * now.variance_factor).sqrt();
+                (plain, self.shared(now, &TrackNoise::of_detector(factor)))
+            }
+            Correlation::Measured => {
+                self.meter.age();
+                for (before, track) in with_before(self.last.as_ref(), now) {
+                    if let Some(residual) = &track.residual {
+                        let before = before.and_then(|before| before.residual.as_ref());
+                        self.meter.observe(before, residual);
+                    }
+                }
+                let noise = self.meter.noise();
+                let own = now
+                    .tracks
+                    .iter()
+                    .map(|t| noise.covariance(&t.influence))
+                    .sum();
+                (se3::symmetric(&own), self.shared(now, &noise))
             }
         }
-        cross * (last.variance_factor * motion.variance_factor).sqrt()
+    }
+
+    fn shared(&self, now: &LastMotion, noise: &TrackNoise) -> Matrix6<f64> {
+        with_before(self.last.as_ref(), now)
+            .filter_map(|(before, track)| {
+                Some(noise.covariance_with_next(&before?.influence, &track.influence))
+            })
+            .sum()
     }
 
     /// The derivative of a motion by the rig's parameters, where the rig is uncertain at all.
@@ -130,8 +187,8 @@ impl<'a> TwoFrameChain<'a> {
 
     fn advance(&mut self, place: &Place, motion: &TwoFrameMotion) -> Option<FrameEstimate> {
         let prev_from_now = motion.estimate.prev_from_now;
-        let cov_motion = motion.estimate.cov_right * motion.variance_factor;
-        let cross = self.covariance_with_last(motion);
+        let tracks = self.tracks_of(motion);
+        let (cov_motion, cross) = self.covariances(motion, &tracks);
         let mut odom_from_camera = place.odom_from_camera * prev_from_now;
         odom_from_camera.rotation.renormalize();
         let by_rig = self.by_rig(motion)?;
@@ -146,16 +203,7 @@ impl<'a> TwoFrameChain<'a> {
             ),
             by_rig: place.by_rig.chain(&prev_from_now, &by_rig),
         };
-        let tracks = motion.tracks.iter().zip(&motion.influences);
-        self.last = Some(LastMotion {
-            tracks: tracks
-                .map(|(&i, influence)| {
-                    let i = i as usize;
-                    (self.ids[i], *influence, self.points[i].now.sigma_px)
-                })
-                .collect(),
-            variance_factor: motion.variance_factor,
-        });
+        self.last = Some(tracks);
         self.place = Some(next);
         let calibration = |by: &Sensitivity<RIG_PARAMETERS>| {
             let considered = self.considered.as_ref();
@@ -185,6 +233,18 @@ impl<'a> TwoFrameChain<'a> {
             cov_pose: Matrix6::zeros(),
         }
     }
+}
+
+/// The tracks of a motion, each with what it was in the motion before.
+fn with_before<'t>(
+    last: Option<&'t LastMotion>,
+    now: &'t LastMotion,
+) -> impl Iterator<Item = (Option<&'t LastTrack>, &'t LastTrack)> {
+    let mut earlier = last.map_or(&[][..], |last| &last.tracks).iter().peekable();
+    now.tracks.iter().map(move |track| {
+        while earlier.next_if(|other| other.id < track.id).is_some() {}
+        (earlier.next_if(|other| other.id == track.id), track)
+    })
 }
 
 impl FrameEstimator for TwoFrameChain<'_> {

@@ -65,7 +65,8 @@ fn equal_scales(x: (f64, f64), y: (f64, f64), most_height: f64) -> (Frame, Scale
         height,
     };
     let x = Scale::linear(about(x, width), (LEFT_PX, LEFT_PX + width));
-    let y = Scale::linear(about(y, height), (TOP_PX + height, TOP_PX));
+    // What lies to the right of the way ahead is below it, as on a map.
+    let y = Scale::linear(about(y, height), (TOP_PX, TOP_PX + height));
     (frame, x, y)
 }
 

@@ -36,8 +36,8 @@ pub use estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 pub use motion::{MotionOutcome, run_motion};
 pub use odometry::{OdometryOutcome, run_odometry, run_odometry_with};
 pub use page::{FigureFile, figure_files};
-pub use settings::{RigError, Settings};
-pub use table::{Outcomes, summary_text, write_csv};
+pub use settings::{Correlation, RigError, Settings};
+pub use table::{Outcomes, summary_text, to_csv, to_json};
 pub use triangulation::{PointOutcome, TriangulationOutcome, run_triangulation};
 pub use verdict::Verdict;
 

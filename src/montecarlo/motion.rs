@@ -95,7 +95,7 @@ impl Settings {
             self.estimator,
             model,
             self.gate_sigma2,
-            self.cross_terms,
+            self.correlation,
         );
         match rig.covariance() {
             Some(covariance) if self.rig_error == RigError::Considered => {

@@ -17,6 +17,18 @@ pub enum RigError {
     Ignored,
 }
 
+/// How the correlation of consecutive motions, which share pixels, is accounted for.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Correlation {
+    /// Not at all: motions are taken as independent, as the thesis does.
+    Independent,
+    /// Each pair's noise is taken as its own, and the same in both motions that use it.
+    Shared,
+    /// As the residuals of tracks over several pairs tell.
+    #[default]
+    Measured,
+}
+
 /// What is simulated, and how often.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Settings {
@@ -59,9 +71,9 @@ pub struct Settings {
     /// Largest squared residual of a track that counts. σ², 1 to 1e6, default 20, as the pipeline
     /// has it.
     pub gate_sigma2: f64,
-    /// Whether the correlation of consecutive motions, which share pixels, is accounted for.
-    /// Default yes; no shows what that costs.
-    pub cross_terms: bool,
+    /// How the correlation of consecutive motions, which share pixels, is accounted for. Default
+    /// measured, as residuals tell.
+    pub correlation: Correlation,
 }
 
 impl Default for Settings {
@@ -83,7 +95,7 @@ impl Default for Settings {
             stated_sigma_px: None,
             rig_error: RigError::None,
             gate_sigma2: 20.0,
-            cross_terms: true,
+            correlation: Correlation::Measured,
         }
     }
 }

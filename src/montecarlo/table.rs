@@ -64,7 +64,7 @@ fn rows(outcomes: &Outcomes) -> Vec<Row<'_>> {
 /// Every verdict as CSV: one row a point, a motion, all increments, and each pose of the path.
 /// Lengths in m, angles in rad; what does not exist is empty.
 #[must_use]
-pub fn write_csv(outcomes: &Outcomes) -> String {
+pub fn to_csv(outcomes: &Outcomes) -> String {
     let mut out = "stage,at,runs,failed,degrees_of_freedom,anees,anees_low,anees_high,coverage,coverage_low,\
                    coverage_high,sigma_translation_first_order_m,sigma_translation_monte_carlo_m,\
                    trace_ratio_translation,ratio_to_bound_translation,sigma_rotation_first_order_rad,\
@@ -109,6 +109,42 @@ fn push_part(out: &mut String, part: Option<&Part>) {
     if let Some(ratio) = p.ratio_to_bound {
         let _ = write!(out, "{ratio:?}");
     }
+}
+
+/// The same as JSON: a list of objects with the CSV's names and numbers, absent ones `null`.
+///
+/// # Errors
+/// Never for numbers; what serde says otherwise.
+pub fn to_json(outcomes: &Outcomes) -> serde_json::Result<String> {
+    #[derive(serde::Serialize)]
+    struct Object<'a> {
+        stage: &'a str,
+        at: Option<f64>,
+        runs: u64,
+        failed: u64,
+        degrees_of_freedom: usize,
+        anees: f64,
+        anees_interval: (f64, f64),
+        coverage: f64,
+        coverage_interval: (f64, f64),
+        translation_m: Part,
+        rotation_rad: Option<Part>,
+    }
+    let rows = rows(outcomes);
+    let objects = rows.iter().map(|row| Object {
+        stage: row.stage,
+        at: row.at.parse().ok(),
+        runs: row.verdict.runs,
+        failed: row.failed,
+        degrees_of_freedom: row.verdict.degrees_of_freedom,
+        anees: row.verdict.anees,
+        anees_interval: row.verdict.anees_interval,
+        coverage: row.verdict.coverage,
+        coverage_interval: row.verdict.coverage_interval,
+        translation_m: row.verdict.translation(),
+        rotation_rad: row.verdict.rotation(),
+    });
+    serde_json::to_string_pretty(&objects.collect::<Vec<_>>())
 }
 
 /// The table for a person: points, motion, increments, and some of the path's poses.

@@ -37,7 +37,7 @@ pub struct Verdict {
 }
 
 /// Half of a [`Verdict`]: translations, or rotations.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
 pub struct Part {
     /// Stated 1 σ, the root of the trace: m or rad.
     pub sigma_first_order: f64,
