@@ -37,17 +37,6 @@ impl Influence {
         };
         of(&self.by_prev, &point.prev.sigma_px) + of(&self.by_now, &point.now.sigma_px)
     }
-
-    /// What one track contributes to `Cov(δm, δm')` of this motion and the one after it: the pixels
-    /// that are now this motion's present view are then the next one's previous view.
-    #[must_use]
-    pub fn covariance_with_next(&self, sigma_now_px: &Vector4<f64>, next: &Self) -> Matrix6<f64> {
-        let mut scaled = self.by_now;
-        for (mut column, sigma) in scaled.column_iter_mut().zip(sigma_now_px) {
-            column *= sigma * sigma;
-        }
-        product_transposed(&scaled, &next.by_prev)
-    }
 }
 
 /// Both triangulated points of a track with their derivatives by their pixels, where depth is

@@ -7,6 +7,7 @@ pub mod consensus;
 pub mod influence;
 mod model;
 mod motion;
+pub mod motion_chain;
 mod odometer;
 pub mod planar;
 pub mod reprojection;

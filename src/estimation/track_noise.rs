@@ -54,16 +54,6 @@ impl TrackNoise {
         let shared = product_transposed(p, q) * self.persistence;
         se3::symmetric(&((own + shared + shared.transpose()) * self.variance_factor))
     }
-
-    /// What one track contributes to `Cov(δm, δm')` of a motion and the one after it; both are
-    /// [`whitened`].
-    #[must_use]
-    pub fn covariance_with_next(&self, influence: &Influence, next: &Influence) -> Matrix6<f64> {
-        let reused = product_transposed(&influence.by_now, &next.by_prev) * self.reuse;
-        let lasting = product_transposed(&influence.by_prev, &(next.by_prev + next.by_now))
-            + product_transposed(&influence.by_now, &next.by_now);
-        (reused + lasting * self.persistence) * self.variance_factor
-    }
 }
 
 /// An influence by pixels in units of their σ.

@@ -3,13 +3,12 @@
 use super::Correlation;
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
-use crate::estimation::influence::Influence;
+use crate::estimation::motion_chain::{ChainedTrack, MotionChain};
 use crate::estimation::track_noise::{self, TrackNoise, TrackNoiseMeter, TrackResidual};
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
 use crate::estimation::{Model, calibration, inverse_depth};
 use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
 use crate::geometry::{StereoRig, se3};
-use crate::uncertainty::compounding;
 use crate::uncertainty::consider::Sensitivity;
 use nalgebra::{Isometry3, Matrix6, Vector3, Vector6};
 
@@ -23,7 +22,8 @@ pub struct TwoFrameChain<'a> {
     considered: Option<Box<RigCovariance>>,
     before: Vec<(TrackedSight, Option<Vector3<f64>>)>,
     place: Option<Place>,
-    last: Option<LastMotion>,
+    chain: MotionChain,
+    residuals: Vec<(u64, TrackResidual)>,
     ids: Vec<u64>,
     points: Vec<TrackedPoint>,
 }
@@ -33,22 +33,7 @@ pub struct TwoFrameChain<'a> {
 struct Place {
     prev_from_now: Isometry3<f64>,
     odom_from_camera: Isometry3<f64>,
-    /// Covariance of the pose from the pixels' noise alone.
-    measurement: Matrix6<f64>,
     by_rig: Sensitivity<RIG_PARAMETERS>,
-}
-
-/// The tracks of the last motion, with rising ids.
-struct LastMotion {
-    tracks: Vec<LastTrack>,
-    variance_factor: f64,
-}
-
-/// What a track's pixels, in units of their σ, did to the last motion, and what was left of them.
-struct LastTrack {
-    id: u64,
-    influence: Influence,
-    residual: Option<TrackResidual>,
 }
 
 impl<'a> TwoFrameChain<'a> {
@@ -69,7 +54,8 @@ impl<'a> TwoFrameChain<'a> {
             considered: None,
             before: Vec::new(),
             place: None,
-            last: None,
+            chain: MotionChain::default(),
+            residuals: Vec::new(),
             ids: Vec::new(),
             points: Vec::new(),
         }
@@ -103,69 +89,48 @@ impl<'a> TwoFrameChain<'a> {
         }
     }
 
-    /// The tracks of a motion, whitened, with their residuals where these are to be measured.
-    fn tracks_of(&self, motion: &TwoFrameMotion) -> LastMotion {
-        let measured = self.correlation == Correlation::Measured;
-        let tracks = motion.tracks.iter().zip(&motion.influences);
-        let prev_from_now = motion.reprojected;
-        LastMotion {
-            tracks: tracks
-                .map(|(&i, influence)| {
-                    let point = &self.points[i as usize];
-                    let residual = measured
-                        .then(|| TrackResidual::new(self.rig, &prev_from_now, point))
-                        .flatten();
-                    LastTrack {
-                        id: self.ids[i as usize],
-                        influence: track_noise::whitened(influence, point),
-                        residual,
-                    }
-                })
-                .collect(),
-            variance_factor: motion.variance_factor,
-        }
-    }
-
-    /// Covariance of the motion, and `Cov(δm_last, δm)`: from the pixels that both motions used
-    /// (theory §4).
-    fn covariances(
-        &mut self,
-        motion: &TwoFrameMotion,
-        now: &LastMotion,
-    ) -> (Matrix6<f64>, Matrix6<f64>) {
-        let plain = motion.estimate.cov_right * motion.variance_factor;
+    /// What the tracks' noise is in this motion: as assumed, or as residuals tell.
+    fn noise_in(&mut self, motion: &TwoFrameMotion) -> TrackNoise {
+        let detector = TrackNoise::of_detector(motion.variance_factor);
         match self.correlation {
-            Correlation::Independent => (plain, Matrix6::zeros()),
-            Correlation::Shared => {
-                let factor = self.last.as_ref().map_or(1.0, |last| last.variance_factor);
-                let factor = (factor * now.variance_factor).sqrt();
-                (plain, self.shared(now, &TrackNoise::of_detector(factor)))
+            Correlation::Shared => return detector,
+            Correlation::Independent => {
+                return TrackNoise {
+                    reuse: 0.0,
+                    ..detector
+                };
             }
-            Correlation::Measured => {
-                self.meter.age();
-                for (before, track) in with_before(self.last.as_ref(), now) {
-                    if let Some(residual) = &track.residual {
-                        let before = before.and_then(|before| before.residual.as_ref());
-                        self.meter.observe(before, residual);
-                    }
-                }
-                let noise = self.meter.noise();
-                let own = now
-                    .tracks
-                    .iter()
-                    .map(|t| noise.covariance(&t.influence))
-                    .sum();
-                (se3::symmetric(&own), self.shared(now, &noise))
-            }
+            Correlation::Measured => self.meter.age(),
         }
+        let residuals: Vec<(u64, TrackResidual)> = motion
+            .tracks
+            .iter()
+            .filter_map(|&i| {
+                let point = &self.points[i as usize];
+                let residual = TrackResidual::new(self.rig, &motion.reprojected, point)?;
+                Some((self.ids[i as usize], residual))
+            })
+            .collect();
+        let mut before = self.residuals.iter().peekable();
+        for (id, residual) in &residuals {
+            while before.next_if(|(other, _)| other < id).is_some() {}
+            let before = before.next_if(|(other, _)| other == id);
+            self.meter
+                .observe(before.map(|(_, before)| before), residual);
+        }
+        self.residuals = residuals;
+        self.meter.noise()
     }
 
-    fn shared(&self, now: &LastMotion, noise: &TrackNoise) -> Matrix6<f64> {
-        with_before(self.last.as_ref(), now)
-            .filter_map(|(before, track)| {
-                Some(noise.covariance_with_next(&before?.influence, &track.influence))
+    /// The tracks of a motion for the chain.
+    fn chained(&self, motion: &TwoFrameMotion) -> Vec<ChainedTrack> {
+        let tracks = motion.tracks.iter().zip(&motion.influences);
+        tracks
+            .map(|(&i, influence)| ChainedTrack {
+                id: self.ids[i as usize],
+                influence: track_noise::whitened(influence, &self.points[i as usize]),
             })
-            .sum()
+            .collect()
     }
 
     /// The derivative of a motion by the rig's parameters, where the rig is uncertain at all.
@@ -187,23 +152,19 @@ impl<'a> TwoFrameChain<'a> {
 
     fn advance(&mut self, place: &Place, motion: &TwoFrameMotion) -> Option<FrameEstimate> {
         let prev_from_now = motion.estimate.prev_from_now;
-        let tracks = self.tracks_of(motion);
-        let (cov_motion, cross) = self.covariances(motion, &tracks);
+        let noise = self.noise_in(motion);
+        let tracks = self.chained(motion);
+        let own = tracks.iter().map(|t| noise.covariance(&t.influence));
+        let cov_motion = se3::symmetric(&own.sum());
+        self.chain.advance(&prev_from_now, &tracks, &noise);
         let mut odom_from_camera = place.odom_from_camera * prev_from_now;
         odom_from_camera.rotation.renormalize();
         let by_rig = self.by_rig(motion)?;
         let next = Place {
             prev_from_now,
             odom_from_camera,
-            measurement: compounding::chain_correlated(
-                &place.measurement,
-                &prev_from_now,
-                &cov_motion,
-                &cross,
-            ),
             by_rig: place.by_rig.chain(&prev_from_now, &by_rig),
         };
-        self.last = Some(tracks);
         self.place = Some(next);
         let calibration = |by: &Sensitivity<RIG_PARAMETERS>| {
             let considered = self.considered.as_ref();
@@ -213,7 +174,7 @@ impl<'a> TwoFrameChain<'a> {
             prev_from_now,
             cov_motion: cov_motion + calibration(&by_rig),
             odom_from_camera,
-            cov_pose: next.measurement + calibration(&next.by_rig),
+            cov_pose: self.chain.covariance(&noise) + calibration(&next.by_rig),
         })
     }
 
@@ -223,7 +184,6 @@ impl<'a> TwoFrameChain<'a> {
         self.place = Some(Place {
             prev_from_now: identity,
             odom_from_camera: identity,
-            measurement: Matrix6::zeros(),
             by_rig: Sensitivity::default(),
         });
         FrameEstimate {
@@ -233,18 +193,6 @@ impl<'a> TwoFrameChain<'a> {
             cov_pose: Matrix6::zeros(),
         }
     }
-}
-
-/// The tracks of a motion, each with what it was in the motion before.
-fn with_before<'t>(
-    last: Option<&'t LastMotion>,
-    now: &'t LastMotion,
-) -> impl Iterator<Item = (Option<&'t LastTrack>, &'t LastTrack)> {
-    let mut earlier = last.map_or(&[][..], |last| &last.tracks).iter().peekable();
-    now.tracks.iter().map(move |track| {
-        while earlier.next_if(|other| other.id < track.id).is_some() {}
-        (earlier.next_if(|other| other.id == track.id), track)
-    })
 }
 
 impl FrameEstimator for TwoFrameChain<'_> {
