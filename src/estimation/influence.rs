@@ -140,3 +140,85 @@ pub fn covariance(influences: &[Influence], points: &[TrackedPoint]) -> Matrix6<
         .sum();
     se3::symmetric(&sum)
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::synthetic::{random, rig, tracks};
+    use crate::estimation::two_frame::{Estimator, TwoFrame};
+    use crate::estimation::{MotionModel, Plane};
+    use nalgebra::{Isometry2, Vector2, Vector6};
+
+    const ESTIMATORS: [Estimator; 3] = [Estimator::Svd, Estimator::Weighted, Estimator::Bundle];
+
+    /// A motion in the plane serves both models.
+    fn planar_step(rig: &StereoRig) -> Isometry3<f64> {
+        Plane::of(rig).lift(&Isometry2::new(Vector2::new(0.3, -0.04), 0.05))
+    }
+
+    #[test]
+    fn influences_are_the_derivatives_of_the_estimate() {
+        let rig = rig();
+        let truth = planar_step(&rig);
+        let points = tracks(&rig, &truth, 12, [2.0, 8.0], 0.0, &mut random(21));
+        for model in [MotionModel::Se3, MotionModel::Planar] {
+            for estimator in ESTIMATORS {
+                let mut two_frame = TwoFrame::new(estimator, model.of(&rig), 1e6);
+                let mut solve = |points: &[TrackedPoint]| {
+                    two_frame
+                        .estimate(&rig, &truth, points)
+                        .expect("determined")
+                };
+                let base = solve(&points);
+                assert_eq!(base.tracks.len(), points.len());
+                for (i, influence) in base.influences.iter().enumerate().step_by(4) {
+                    for j in 0..8 {
+                        let step = 1e-2;
+                        let mut numeric = Vector6::zeros();
+                        for sign in [1.0, -1.0] {
+                            let mut moved = points.clone();
+                            let m = if j < 4 {
+                                &mut moved[i].prev
+                            } else {
+                                &mut moved[i].now
+                            };
+                            m.px[j % 4] += sign * step;
+                            let found = solve(&moved).estimate.prev_from_now;
+                            let change = base.estimate.prev_from_now.inverse() * found;
+                            numeric += se3::log(&change) * (sign / (2.0 * step));
+                        }
+                        let by = if j < 4 {
+                            &influence.by_prev
+                        } else {
+                            &influence.by_now
+                        };
+                        let exact = by.column(j % 4);
+                        // Central differences leave the third order: (1e-2 px)² of some 1e-2.
+                        let scale = influence.by_now.norm();
+                        assert!(
+                            (numeric - exact).norm() < 1e-5 * scale,
+                            "{estimator:?} {model:?} {i} {j} {numeric} {exact}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn the_covariance_is_the_sum_over_the_pixels() {
+        let rig = rig();
+        let truth = planar_step(&rig);
+        let points = tracks(&rig, &truth, 40, [2.0, 30.0], 0.0, &mut random(22));
+        for model in [MotionModel::Se3, MotionModel::Planar] {
+            let mut two_frame = TwoFrame::new(Estimator::Bundle, model.of(&rig), 1e6);
+            let found = two_frame
+                .estimate(&rig, &truth, &points)
+                .expect("determined");
+            let summed = covariance(&found.influences, &points);
+            let stated = found.estimate.cov_right;
+            // For the most likely motion, (JᵀWJ)⁻¹ and J⁺ Σ J⁺ᵀ are the same.
+            assert!((summed - stated).norm() < 1e-9 * stated.norm());
+        }
+    }
+}

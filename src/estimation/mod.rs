@@ -13,6 +13,8 @@ pub mod planar;
 pub mod reprojection;
 mod settings;
 mod sight;
+#[cfg(test)]
+mod synthetic;
 pub mod track_noise;
 mod triangulation;
 pub mod two_frame;

@@ -48,3 +48,38 @@ pub fn align(
         rotation.angle(),
     ))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::se2;
+    use crate::simulation::thesis_rig;
+    use nalgebra::Vector3;
+    use proptest::prelude::*;
+
+    proptest! {
+        #[test]
+        fn an_exact_motion_is_found(
+            xi in prop::array::uniform3(-1.5..1.5_f64),
+            cloud in prop::collection::vec(prop::array::uniform3(-3.0..3.0_f64), 2..15),
+        ) {
+            let plane = Plane::of(&thesis_rig());
+            let now: Vec<Point3<f64>> = cloud.iter().map(|p| Point3::new(p[0], p[1], 6.0 + p[2])).collect();
+            let spread = now.iter().map(|p| (p - now[0]).xz().norm()).fold(0.0, f64::max);
+            prop_assume!(spread > 0.1);
+            let truth = se2::exp(&Vector3::from(xi));
+            let lifted = plane.lift(&truth);
+            let found = align(&plane, now.iter().map(|p| (lifted * p, *p))).expect("spread");
+            prop_assert!((found.to_homogeneous() - truth.to_homogeneous()).norm() < 1e-9);
+        }
+    }
+
+    #[test]
+    fn what_lies_in_one_place_is_refused() {
+        let plane = Plane::of(&thesis_rig());
+        // Apart in height only: the same place on the ground.
+        let pairs = [0.0, 1.0, 2.0].map(|y| (Point3::new(1.0, y, 5.0), Point3::new(1.0, y, 4.0)));
+        assert!(align(&plane, pairs.iter().copied()).is_none());
+        assert!(align(&plane, pairs[..1].iter().copied()).is_none());
+    }
+}

@@ -70,7 +70,15 @@ impl Reprojection {
             let (inverse, gradient) = self.solve(model)?;
             let step = inverse * gradient;
             let gain = step.dot(&gradient) + self.tracks.iter().map(|t| t.own_gain).sum::<f64>();
-            if gain <= SMALL_GAIN || iterations >= MAX_ITERATIONS {
+            if gain <= SMALL_GAIN {
+                // So short that the equations need not be set up anew.
+                for (p, track) in points.iter_mut().zip(&self.tracks) {
+                    p.inverse_depth += track.step_with(&step);
+                }
+                motion *= se3::exp(&step);
+                break;
+            }
+            if iterations >= MAX_ITERATIONS {
                 break;
             }
             match self.walk(rig, &motion, &step, cost, points, &mut iterations) {
@@ -120,7 +128,7 @@ impl Reprojection {
         let steps: Vec<Vector3<f64>> = self
             .tracks
             .iter()
-            .map(|t| t.point_alone + product(&t.point_by_motion, step))
+            .map(|track| track.step_with(step))
             .collect();
         self.start.clear();
         self.start.extend(points.iter().map(|p| p.inverse_depth));
@@ -226,6 +234,11 @@ impl TrackEquations {
             weighted_squares: before.weighted_squares + after.weighted_squares,
         })
     }
+
+    /// The point's step that goes with a step of the motion.
+    fn step_with(&self, motion: &Vector6<f64>) -> Vector3<f64> {
+        self.point_alone + product(&self.point_by_motion, motion)
+    }
 }
 
 /// One pair's measurement of a track, weighed.
@@ -264,5 +277,70 @@ fn huber(squares: f64) -> (f64, f64) {
             HUBER_SIGMAS / sigmas,
             HUBER_SIGMAS * (2.0 * sigmas - HUBER_SIGMAS),
         )
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::bundle::Adjuster;
+    use crate::estimation::synthetic::{random, rig, step, tracks};
+    use crate::estimation::{MotionModel, Plane};
+    use nalgebra::{Isometry2, Vector2};
+
+    #[test]
+    fn it_agrees_with_the_bundle_adjustment() {
+        let rig = rig();
+        let mut rng = random(11);
+        for _ in 0..20 {
+            let points = tracks(&rig, &step(), 60, [2.0, 40.0], 0.5, &mut rng);
+            let (mut ours, mut theirs) = (points.clone(), points);
+            let found = Reprojection::default()
+                .adjust(&rig, &Model::Se3, &step(), &mut ours)
+                .expect("determined");
+            let other = Adjuster::default()
+                .adjust(&rig, &step(), &mut theirs)
+                .expect("determined");
+            let apart = se3::log(&(other.motion.prev_from_now.inverse() * found.prev_from_now));
+            // Both stop within a thousandth of a σ or so.
+            let nees = apart.dot(&found.cov_right.cholesky().expect("definite").solve(&apart));
+            assert!(nees < 1e-4, "{nees}");
+            let ratio = (found.cov_right - other.motion.cov_right).norm() / found.cov_right.norm();
+            assert!(ratio < 1e-3, "{ratio}");
+            assert!((found.robust_factor / other.variance_factor - 1.0).abs() < 1e-3);
+        }
+    }
+
+    #[test]
+    fn exact_measurements_give_the_exact_motion_in_the_plane_too() {
+        let rig = rig();
+        let planar = MotionModel::Planar.of(&rig);
+        let truth = Plane::of(&rig).lift(&Isometry2::new(Vector2::new(0.4, 0.05), 0.06));
+        let mut points = tracks(&rig, &truth, 30, [2.0, 40.0], 0.0, &mut random(12));
+        let found = Reprojection::default()
+            .adjust(&rig, &planar, &Isometry3::identity(), &mut points)
+            .expect("determined");
+        let error = se3::log(&(truth.inverse() * found.prev_from_now));
+        assert!(error.norm() < 1e-8, "{error}");
+        // Nothing leaves the plane: heave, roll and pitch are certain.
+        assert_eq!(found.cov_right.column(1).norm(), 0.0);
+        assert!(found.cov_right[(4, 4)] > 0.0);
+    }
+
+    #[test]
+    fn what_does_not_determine_a_motion_is_refused() {
+        let rig = rig();
+        let mut adjuster = Reprojection::default();
+        let mut few = tracks(&rig, &step(), 2, [2.0, 40.0], 0.5, &mut random(13));
+        assert!(
+            adjuster
+                .adjust(&rig, &Model::Se3, &step(), &mut few)
+                .is_none()
+        );
+        let one = tracks(&rig, &step(), 1, [2.0, 40.0], 0.0, &mut random(14))[0];
+        let mut same = vec![one; 5];
+        let found = adjuster.adjust(&rig, &Model::Se3, &step(), &mut same);
+        // One point, however often: rounding may leave a definite matrix, but no certainty.
+        assert!(found.is_none_or(|f| f.cov_right.trace() > 1e3));
     }
 }

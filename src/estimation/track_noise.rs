@@ -123,7 +123,8 @@ impl TrackResidual {
     }
 }
 
-/// What the meter believes before it has seen anything is worth so many tracks.
+/// What the meter believes of persistence and reuse before it has seen anything is worth so many
+/// tracks; what it believes of the variance, one: a single pair tells that well.
 const PRIOR_TRACKS: f64 = 100.0;
 /// Of what was seen, so much counts one pair later: a memory of fifty pairs.
 const MEMORY: f64 = 0.98;
@@ -143,13 +144,16 @@ impl TrackNoiseMeter {
     /// A meter that believes `expected` until residuals tell otherwise.
     #[must_use]
     pub fn new(expected: &TrackNoise) -> Self {
-        let normal = Matrix3::from_diagonal(&Vector3::new(25.0, 5.0, 5.0)) * PRIOR_TRACKS;
-        let s2 = expected.variance_factor;
-        let believed = Vector3::new(s2, s2 * expected.persistence, s2 * expected.reuse);
-        Self {
-            normal,
-            right: normal * believed,
-        }
+        let mut meter = Self {
+            normal: Matrix3::zeros(),
+            right: Vector3::zeros(),
+        };
+        // s² as from one track's five squares; s² λ and s² κ relative to it, whatever it is.
+        meter.add(5.0 * expected.variance_factor, &Vector3::new(5.0, 0.0, 0.0));
+        let weight = (5.0 * PRIOR_TRACKS).sqrt();
+        meter.add(0.0, &(Vector3::new(-expected.persistence, 1.0, 0.0) * weight));
+        meter.add(0.0, &(Vector3::new(-expected.reuse, 0.0, 1.0) * weight));
+        meter
     }
 
     /// Lets go of a little of what was seen: to be called once a pair.
@@ -229,4 +233,121 @@ fn halves(r: &Vector8) -> (Vector4<f64>, Vector4<f64>) {
         r.fixed_rows::<4>(0).into_owned(),
         r.fixed_rows::<4>(4).into_owned(),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::synthetic::{normal4, random, rig, tracks};
+    use nalgebra::Vector2;
+
+    /// Tracks over three pairs; each motion's uses of the pixels have noise of their own, as `noise`
+    /// says.
+    fn measure(noise: &TrackNoise, seed: u64) -> TrackNoise {
+        let rig = rig();
+        let mut rng = random(seed);
+        let step = crate::estimation::synthetic::step();
+        let mut meter = TrackNoiseMeter::new(&TrackNoise::of_detector(1.0));
+        let s = noise.variance_factor.sqrt();
+        for _ in 0..60 {
+            let first = tracks(&rig, &step, 100, [4.0, 40.0], 0.0, &mut rng);
+            for p in &first {
+                let y = p.inverse_depth;
+                let two = (step * step).inverse();
+                let Some(px) = crate::estimation::seen_at(&rig, &two, &y) else {
+                    continue;
+                };
+                if !rig.right.contains(&Vector2::new(px[2], px[3]), 0.0) {
+                    continue;
+                }
+                // λ of the variance lasts; of the rest, κ is such that both uses share it.
+                let lasting = normal4(&mut rng) * noise.persistence.sqrt();
+                let rest = 1.0 - noise.persistence;
+                let same = (noise.reuse - noise.persistence).max(0.0) / rest;
+                let common = normal4(&mut rng) * (rest * same).sqrt();
+                let mut own = || normal4(&mut rng) * (rest * (1.0 - same)).sqrt();
+                let sigma = p.prev.sigma_px;
+                let noisy = |px: &Vector4<f64>, n: Vector4<f64>| px + (n * s).component_mul(&sigma);
+                let (n1, p2) = (lasting + common + own(), lasting + common + own());
+                let mut before = *p;
+                before.prev.px = noisy(&p.prev.px, lasting + normal4(&mut rng) * rest.sqrt());
+                before.now.px = noisy(&p.now.px, n1);
+                let mut now = *p;
+                let Some(seen) = rig.project(
+                    &(step.inverse()
+                        * nalgebra::Point3::from(Vector3::new(y.x, y.y, 1.0) / y.z)),
+                ) else {
+                    continue;
+                };
+                now.prev.px = noisy(&seen, p2);
+                now.now.px = noisy(&px, lasting + normal4(&mut rng) * rest.sqrt());
+                now.now.sigma_px = sigma;
+                now.prev.sigma_px = sigma;
+                before.now.sigma_px = sigma;
+                let Some(at) = crate::estimation::inverse_depth(&rig, &now.prev) else {
+                    continue;
+                };
+                now.inverse_depth = at;
+                let old = TrackResidual::new(&rig, &step, &before).expect("seen");
+                let new = TrackResidual::new(&rig, &step, &now).expect("seen");
+                meter.observe(None, &old);
+                meter.observe(Some(&old), &new);
+            }
+        }
+        meter.noise()
+    }
+
+    #[test]
+    fn the_meter_finds_what_the_noise_is() {
+        for (variance_factor, persistence, reuse) in [
+            (1.0, 0.0, 1.0),
+            (1.0, 0.0, 0.0),
+            (2.0, 0.0, 1.0),
+            (1.0, 0.5, 1.0),
+            (0.5, 0.4, 0.4),
+            (1.0, 0.2, 0.6),
+        ] {
+            let truth = TrackNoise {
+                variance_factor,
+                persistence,
+                reuse,
+            };
+            let found = measure(&truth, 41);
+            // 6000 tracks: σ of λ and κ is about 0.01, and the prior of 100 tracks pulls by 0.02.
+            assert!(
+                (found.variance_factor / variance_factor - 1.0).abs() < 0.05,
+                "{truth:?} {found:?}"
+            );
+            assert!(
+                (found.persistence - persistence).abs() < 0.06,
+                "{truth:?} {found:?}"
+            );
+            assert!((found.reuse - reuse).abs() < 0.06, "{truth:?} {found:?}");
+        }
+    }
+
+    #[test]
+    fn projected_residuals_have_five_degrees_of_freedom() {
+        let rig = rig();
+        let step = crate::estimation::synthetic::step();
+        let points = tracks(&rig, &step, 2000, [2.0, 40.0], 0.5, &mut random(42));
+        let squares: f64 = points
+            .iter()
+            .map(|p| TrackResidual::new(&rig, &step, p).expect("seen").squares())
+            .sum();
+        // χ²(10 000)/10 000 within 3 σ.
+        assert!((squares / 10_000.0 - 1.0).abs() < 0.043, "{squares}");
+    }
+
+    #[test]
+    fn a_meter_that_saw_nothing_believes_what_it_was_told() {
+        let told = TrackNoise {
+            variance_factor: 1.7,
+            persistence: 0.1,
+            reuse: 0.9,
+        };
+        let found = TrackNoiseMeter::new(&told).noise();
+        assert!((found.variance_factor - 1.7).abs() < 1e-12);
+        assert!((found.persistence - 0.1).abs() < 1e-12 && (found.reuse - 0.9).abs() < 1e-12);
+    }
 }

@@ -134,3 +134,159 @@ fn by_twist(p: &Vector3<f64>) -> SMatrix<f64, 3, 6> {
         .copy_from(&-so3::hat(p));
     jacobian
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::synthetic::{random, rig};
+    use crate::estimation::{MotionModel, Plane};
+    use nalgebra::{Isometry2, Point3, Vector2};
+    use rand_distr::{Distribution, StandardNormal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    fn normal3(rng: &mut Xoshiro256PlusPlus) -> Vector3<f64> {
+        Vector3::from_fn(|_, _| StandardNormal.sample(rng))
+    }
+
+    /// Points with covariances as a rig has them: long along the view where `isotropic` is false.
+    fn cloud(count: usize, isotropic: bool, rng: &mut Xoshiro256PlusPlus) -> Vec<Landmark> {
+        (0..count)
+            .map(|i| {
+                let n = normal3(rng);
+                let z = 8.0 + 2.0 * n.z;
+                let ray = Vector3::new(0.3 * n.x, 0.2 * n.y, 1.0);
+                let sigma = 0.004 * (1.0 + (i % 3) as f64);
+                let depth = if isotropic { 0.0 } else { 0.05 };
+                Landmark {
+                    point: Point3::from(ray * z),
+                    cov_m2: Matrix3::identity() * (sigma * sigma)
+                        + ray * ray.transpose() * (depth * depth),
+                }
+            })
+            .collect()
+    }
+
+    fn moved(cloud: &[Landmark], prev_from_now: &Isometry3<f64>) -> Vec<Landmark> {
+        let r = *prev_from_now.rotation.to_rotation_matrix().matrix();
+        let one = |l: &Landmark| Landmark {
+            point: prev_from_now * l.point,
+            cov_m2: r * l.cov_m2 * r.transpose(),
+        };
+        cloud.iter().map(one).collect()
+    }
+
+    fn disturbed(l: &Landmark, rng: &mut Xoshiro256PlusPlus) -> Landmark {
+        let root = l.cov_m2.cholesky().expect("definite").l();
+        Landmark {
+            point: l.point + root * normal3(rng),
+            cov_m2: l.cov_m2,
+        }
+    }
+
+    fn truth() -> Isometry3<f64> {
+        Plane::of(&rig()).lift(&Isometry2::new(Vector2::new(0.5, 0.1), 0.1))
+    }
+
+    fn models() -> [Model; 2] {
+        [MotionModel::Se3.of(&rig()), MotionModel::Planar.of(&rig())]
+    }
+
+    #[test]
+    fn gradient_matches_central_differences_with_residuals_of_their_own() {
+        // Equal in all directions, so that the weights do not move with the motion.
+        let mut rng = random(31);
+        let now = cloud(8, true, &mut rng);
+        let pairs: Vec<(Landmark, Landmark)> = moved(&now, &truth())
+            .iter()
+            .zip(&now)
+            .map(|(prev, now)| {
+                let far = |l: &Landmark, rng: &mut Xoshiro256PlusPlus| Landmark {
+                    point: l.point + normal3(rng) * 0.2,
+                    ..*l
+                };
+                (far(prev, &mut rng), far(now, &mut rng))
+            })
+            .collect();
+        for model in models() {
+            let solve = |pairs: &[(Landmark, Landmark)]| {
+                align(&model, pairs).expect("spread").prev_from_now
+            };
+            let base = solve(&pairs);
+            let exact = derivative(&model, &base, &pairs).expect("definite");
+            for (i, (by_prev, by_now)) in exact.iter().enumerate() {
+                for axis in 0..3 {
+                    for (side, by) in [by_prev, by_now].into_iter().enumerate() {
+                        let step = 1e-5;
+                        let mut numeric = Vector6::zeros();
+                        for sign in [1.0, -1.0] {
+                            let mut other = pairs.clone();
+                            let l = if side == 0 {
+                                &mut other[i].0
+                            } else {
+                                &mut other[i].1
+                            };
+                            l.point[axis] += sign * step;
+                            let change = base.inverse() * solve(&other);
+                            numeric += se3::log(&change) * (sign / (2.0 * step));
+                        }
+                        let gap = (numeric - by.column(axis)).norm();
+                        assert!(
+                            gap < 1e-6 * by.norm().max(1e-2),
+                            "{model:?} {i} {axis} {side} {gap}"
+                        );
+                    }
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn covariance_holds_against_monte_carlo() {
+        const RUNS: usize = 1000;
+        let mut rng = random(32);
+        let now = cloud(30, false, &mut rng);
+        let prev = moved(&now, &truth());
+        for model in models() {
+            let mut sum = 0.0;
+            for _ in 0..RUNS {
+                let pairs: Vec<_> = prev
+                    .iter()
+                    .zip(&now)
+                    .map(|(p, n)| (disturbed(p, &mut rng), disturbed(n, &mut rng)))
+                    .collect();
+                let found = align(&model, &pairs).expect("spread");
+                let error = se3::log(&(truth().inverse() * found.prev_from_now));
+                sum += model.nees(&error, &found.cov_right).expect("definite");
+            }
+            let freedom = model.degrees_of_freedom();
+            let anees = sum / (RUNS * freedom) as f64;
+            let (low, high) = crate::uncertainty::consistency::anees_interval(freedom, RUNS, 0.997);
+            assert!(
+                (low..high).contains(&anees),
+                "{model:?}: {anees} {low} {high}"
+            );
+        }
+    }
+
+    #[test]
+    fn weights_are_worth_it() {
+        let mut rng = random(33);
+        let now = cloud(30, false, &mut rng);
+        let prev = moved(&now, &truth());
+        let (mut weighted, mut plain) = (0.0, 0.0);
+        for _ in 0..50 {
+            let pairs: Vec<_> = prev
+                .iter()
+                .zip(&now)
+                .map(|(p, n)| (disturbed(p, &mut rng), disturbed(n, &mut rng)))
+                .collect();
+            let error = |found: &Isometry3<f64>| {
+                (found.translation.vector - truth().translation.vector).norm_squared()
+            };
+            weighted += error(&align(&Model::Se3, &pairs).expect("spread").prev_from_now);
+            let points = pairs.iter().map(|(p, n)| (p.point, n.point));
+            plain += error(&closed_form::align(points).expect("spread"));
+        }
+        assert!(weighted < 0.3 * plain, "{weighted} {plain}");
+    }
+}

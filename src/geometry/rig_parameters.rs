@@ -181,7 +181,7 @@ pub fn parse_rig_covariance(rig: &StereoRig, text: &str) -> Result<RigCovariance
     }
     let mut covariance = RigCovariance::zeros();
     let mut rows = 0;
-    for (line, i) in lines.by_ref().zip(&slots) {
+    for (i, line) in slots.iter().zip(lines.by_ref()) {
         rows += 1;
         let numbers: Vec<&str> = line.split(',').map(str::trim).collect();
         if numbers.len() != slots.len() {

@@ -27,6 +27,8 @@ mod odometry;
 mod page;
 mod settings;
 mod table;
+#[cfg(test)]
+mod tests;
 mod triangulation;
 pub mod verdict;
 mod world;

@@ -4,5 +4,6 @@ pub mod compounding;
 pub mod consider;
 pub mod consistency;
 mod implicit;
+pub mod planar;
 
 pub use implicit::{derivative_of_minimiser, propagate};
