@@ -13,7 +13,8 @@
 //!
 //! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
 //! [`pipeline`] (threads), [`config`] and `cli`. Beside them stand [`simulation`], which renders
-//! recordings with known truth, and [`evaluation`], which compares an estimate with it.
+//! recordings with known truth, [`montecarlo`], which holds covariances against the errors of many
+//! runs, and [`evaluation`], which compares an estimate with the truth.
 
 pub mod capture;
 pub mod config;
@@ -23,6 +24,7 @@ pub mod features;
 pub mod geometry;
 pub mod image;
 pub mod matching;
+pub mod montecarlo;
 pub mod output;
 pub mod pipeline;
 pub mod refinement;

@@ -6,6 +6,7 @@ mod features;
 #[cfg(feature = "ipc")]
 mod health;
 mod listen;
+mod montecarlo;
 mod progress;
 mod replay;
 mod report;
@@ -39,6 +40,7 @@ enum Command {
     Evaluate(evaluate::Args),
     Report(report::Args),
     Features(features::Args),
+    Montecarlo(Box<montecarlo::Args>),
     Rig(rig::Args),
 }
 
@@ -74,6 +76,7 @@ pub fn main() -> ExitCode {
         Command::Evaluate(args) => evaluate::run(&args),
         Command::Report(args) => report::run(&args),
         Command::Features(args) => features::run(&args),
+        Command::Montecarlo(args) => montecarlo::run(&args),
         Command::Rig(args) => rig::run(&args),
     };
     match result {

@@ -13,3 +13,9 @@ pub(crate) fn pairs(pairs: Option<u64>) -> ProgressBar {
         None => ProgressBar::new_spinner(),
     }
 }
+
+/// A bar over `runs` runs of an experiment.
+pub(crate) fn runs(runs: u64) -> ProgressBar {
+    let style = ProgressStyle::with_template("{bar:40} {pos}/{len} runs, {eta} left");
+    ProgressBar::new(runs).with_style(style.unwrap_or_else(|_| ProgressStyle::default_bar()))
+}

@@ -95,7 +95,7 @@ pub fn align_with_covariance(
 /// One point's part of `∂²C/∂ξ²`, second-order terms of the rotation included. With `q` the
 /// earlier point carried into the current frame and `e = p − q`, the point's cost is
 /// `‖exp(φ) p + ρ − q‖²`.
-fn hessian_of_point(p: &Vector3<f64>, q: &Vector3<f64>) -> Matrix6<f64> {
+pub(super) fn hessian_of_point(p: &Vector3<f64>, q: &Vector3<f64>) -> Matrix6<f64> {
     let e = p - q;
     let hat_p = so3::hat(p);
     let mut hessian = Matrix6::zeros();
@@ -117,7 +117,7 @@ fn hessian_of_point(p: &Vector3<f64>, q: &Vector3<f64>) -> Matrix6<f64> {
 }
 
 /// `∂²C/∂ξ∂p` of one point.
-fn mixed_by_now(q: &Vector3<f64>) -> SMatrix<f64, 6, 3> {
+pub(super) fn mixed_by_now(q: &Vector3<f64>) -> SMatrix<f64, 6, 3> {
     let mut mixed = SMatrix::<f64, 6, 3>::zeros();
     mixed
         .fixed_view_mut::<3, 3>(0, 0)
@@ -129,7 +129,7 @@ fn mixed_by_now(q: &Vector3<f64>) -> SMatrix<f64, 6, 3> {
 }
 
 /// `∂²C/∂ξ∂p'` of one point; `rotation` is that of `now_from_prev`.
-fn mixed_by_prev(p: &Vector3<f64>, rotation: &Matrix3<f64>) -> SMatrix<f64, 6, 3> {
+pub(super) fn mixed_by_prev(p: &Vector3<f64>, rotation: &Matrix3<f64>) -> SMatrix<f64, 6, 3> {
     let mut mixed = SMatrix::<f64, 6, 3>::zeros();
     mixed
         .fixed_view_mut::<3, 3>(0, 0)

@@ -1,15 +1,27 @@
 //! Estimation: matched features in, motion and pose with covariance out.
 
 pub mod bundle;
+pub mod calibration;
 pub mod closed_form;
 pub mod consensus;
+pub mod influence;
+mod model;
 mod motion;
+pub mod motion_chain;
 mod odometer;
+pub mod planar;
+pub mod reprojection;
 mod settings;
 mod sight;
+#[cfg(test)]
+mod synthetic;
+pub mod track_noise;
 mod triangulation;
+pub mod two_frame;
+pub mod weighted;
 pub mod window;
 
+pub use model::{Model, MotionModel, Plane};
 pub use motion::{MeasuredMotion, measure};
 pub use odometer::{Odometer, PairStamp};
 pub use settings::{Method, Settings};

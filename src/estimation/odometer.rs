@@ -134,7 +134,9 @@ impl Odometer {
         let reference_from_now = measured.estimate.prev_from_now;
         let cov = measured.estimate.cov_right;
         let now = Place {
-            odom_from_camera: renormalised(self.reference.odom_from_camera * reference_from_now),
+            odom_from_camera: se3::renormalised(
+                self.reference.odom_from_camera * reference_from_now,
+            ),
             timestamp_ns: stamp.timestamp_ns,
             detection: compounding::chain(&self.reference.detection, &reference_from_now, &cov),
             bridging: compounding::carry(&self.reference.bridging, &reference_from_now),
@@ -199,7 +201,7 @@ impl Odometer {
         };
         let step = &motion.prev_from_now;
         self.last = Place {
-            odom_from_camera: renormalised(self.last.odom_from_camera * step),
+            odom_from_camera: se3::renormalised(self.last.odom_from_camera * step),
             timestamp_ns: stamp.timestamp_ns,
             detection: compounding::carry(&self.last.detection, step),
             bridging: compounding::chain(&self.last.bridging, step, &motion.cov_right),
@@ -334,10 +336,4 @@ fn velocity_of(motion: &MotionEstimate, dt_s: f64) -> Velocity {
 /// Time from one stamp to a later one, s; 0 where the clock went backwards.
 fn seconds_between(from_ns: i64, to_ns: i64) -> f64 {
     (to_ns.saturating_sub(from_ns).max(0)) as f64 / NS_PER_S
-}
-
-/// Takes out what rounding did to the quaternion's length.
-fn renormalised(mut pose: Isometry3<f64>) -> Isometry3<f64> {
-    pose.rotation.renormalize();
-    pose
 }

@@ -6,8 +6,9 @@
 //! finite everywhere.
 
 use super::StereoMeasurement;
+use crate::geometry::product::{product, transposed_scaled};
 use crate::geometry::{StereoRig, so3};
-use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix4x3, Point3, SMatrix, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix3, Matrix4x3, Point3, SMatrix, Vector3, Vector4};
 
 /// A sight, linearised.
 #[derive(Clone, Copy, Debug)]
@@ -52,17 +53,17 @@ pub fn linearise(
     let right = right_rotation * left + baseline * y.z;
     let (l_px, l_by) = rig.left.project_with_jacobian(&Point3::from(left))?;
     let (r_px, r_by) = rig.right.project_with_jacobian(&Point3::from(right))?;
-    let r_by_left = r_by * right_rotation.matrix();
+    let r_by_left = product(&r_by, right_rotation.matrix());
 
     let left_by_point =
         Matrix3::from_columns(&[r.column(0).into_owned(), r.column(1).into_owned(), t]);
     let mut by_point = Matrix4x3::zeros();
     by_point
         .fixed_view_mut::<2, 3>(0, 0)
-        .copy_from(&(l_by * left_by_point));
-    let mut right_by_point = r_by_left * left_by_point;
+        .copy_from(&product(&l_by, &left_by_point));
+    let mut right_by_point = product(&r_by_left, &left_by_point);
     let mut by_inverse_depth = right_by_point.column_mut(2);
-    by_inverse_depth += r_by * baseline;
+    by_inverse_depth += product(&r_by, &baseline);
     by_point
         .fixed_view_mut::<2, 3>(2, 0)
         .copy_from(&right_by_point);
@@ -75,13 +76,13 @@ pub fn linearise(
         .copy_from(&(l_by * -y.z));
     by_motion
         .fixed_view_mut::<2, 3>(0, 3)
-        .copy_from(&(l_by * turned));
+        .copy_from(&product(&l_by, &turned));
     by_motion
         .fixed_view_mut::<2, 3>(2, 0)
         .copy_from(&(r_by_left * -y.z));
     by_motion
         .fixed_view_mut::<2, 3>(2, 3)
-        .copy_from(&(r_by_left * turned));
+        .copy_from(&product(&r_by_left, &turned));
     Some(Sight {
         px: Vector4::new(l_px.x, l_px.y, r_px.x, r_px.y),
         by_point,
@@ -100,13 +101,13 @@ const MAX_STEPS: usize = 8;
 pub fn inverse_depth(rig: &StereoRig, measurement: &StereoMeasurement) -> Option<Vector3<f64>> {
     let identity = Isometry3::identity();
     let mut y = starting_point(rig, measurement)?;
-    let info = Matrix4::from_diagonal(&measurement.sigma_px.map(|s| 1.0 / (s * s)));
+    let info = measurement.sigma_px.map(|s| 1.0 / (s * s));
     for _ in 0..MAX_STEPS {
         let seen = linearise(rig, &identity, &y)?;
-        let weighted = seen.by_point.transpose() * info;
-        let step = (weighted * seen.by_point)
+        let weighted = transposed_scaled(&seen.by_point, &info);
+        let step = product(&weighted, &seen.by_point)
             .cholesky()?
-            .solve(&(weighted * (measurement.px - seen.px)));
+            .solve(&product(&weighted, &(measurement.px - seen.px)));
         y += step;
         if step.norm() <= 1e-12 * (1.0 + y.norm()) {
             break;

@@ -1,6 +1,7 @@
 //! One camera: a pinhole with lens distortion, from points to raw pixels and back.
 
 use super::Distortion;
+use super::product::product;
 use nalgebra::{Matrix2, Matrix2x3, Point3, Vector2, Vector3};
 
 /// A calibrated camera. Pixels are raw: distorted, unrectified, centres at integers.
@@ -75,7 +76,10 @@ impl Camera {
             inv_z,
             -normalised.y * inv_z,
         );
-        let jacobian = Matrix2::from_diagonal(&self.focal_px) * by_normalised * by_point;
+        let mut jacobian = product(&by_normalised, &by_point);
+        for (mut row, focal) in jacobian.row_iter_mut().zip(&self.focal_px) {
+            row *= *focal;
+        }
         Some((
             distorted.component_mul(&self.focal_px) + self.principal_point_px,
             jacobian,

@@ -1,6 +1,6 @@
 //! Lens distortion on the normalised image plane (z = 1), with its Jacobian, and its inverse.
 
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, SMatrix, Vector2};
 
 /// How a lens moves a point of the normalised image plane.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -32,6 +32,40 @@ impl Distortion {
             Self::Radtan(k) => radtan(k, p),
             Self::Equidistant(k) => equidistant(k, p),
         }
+    }
+
+    /// By how much the distorted position of `p` moves with each coefficient, in their order;
+    /// columns beyond the last coefficient are zero.
+    #[must_use]
+    pub fn by_coefficients(&self, p: &Vector2<f64>) -> SMatrix<f64, 2, 8> {
+        let mut by = SMatrix::<f64, 2, 8>::zeros();
+        match self {
+            Self::None => {}
+            Self::Radtan([k1, k2, _, _, k3, k4, k5, k6]) => {
+                let r2 = p.norm_squared();
+                let powers = [r2, r2 * r2, r2 * r2 * r2];
+                let numerator = 1.0 + k1 * powers[0] + k2 * powers[1] + k3 * powers[2];
+                let denominator = 1.0 + k4 * powers[0] + k5 * powers[1] + k6 * powers[2];
+                let radial = numerator / denominator;
+                for (power, (above, below)) in powers.into_iter().zip([(0, 5), (1, 6), (4, 7)]) {
+                    by.set_column(above, &(p * (power / denominator)));
+                    by.set_column(below, &(p * (-radial * power / denominator)));
+                }
+                let mixed = 2.0 * p.x * p.y;
+                by.set_column(2, &Vector2::new(mixed, r2 + 2.0 * p.y * p.y));
+                by.set_column(3, &Vector2::new(r2 + 2.0 * p.x * p.x, mixed));
+            }
+            Self::Equidistant(_) => {
+                let r = p.norm();
+                let theta = r.atan();
+                // θ/r tends to 1.
+                let ratio = if r > 1e-9 { theta / r } else { 1.0 };
+                for i in 0..4 {
+                    by.set_column(i, &(p * (ratio * theta.powi(2 * i as i32 + 2))));
+                }
+            }
+        }
+        by
     }
 
     /// The position whose distorted image is `distorted`, within `max_radius` (see

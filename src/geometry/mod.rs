@@ -11,9 +11,12 @@
 mod camera;
 mod distortion;
 mod plausibility;
+pub(crate) mod product;
 mod rectification;
 mod rig;
 mod rig_file;
+pub mod rig_parameters;
+pub mod se2;
 pub mod se3;
 pub mod so3;
 

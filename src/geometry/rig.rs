@@ -1,7 +1,9 @@
 //! The stereo rig: two cameras and where the right one stands, as they are; nothing is rectified.
 
 use super::Camera;
+use super::rig_parameters::RigCovariance;
 use nalgebra::{Isometry3, Matrix4x3, Point3, Vector4};
+use std::path::PathBuf;
 
 /// Two calibrated cameras, fixed to each other.
 #[derive(Clone, Debug, PartialEq)]
@@ -18,17 +20,27 @@ pub struct StereoRig {
     pub uncertainty: Option<RigUncertainty>,
 }
 
-/// 1 σ of a rig's parameters, each taken as independent of the others.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct RigUncertainty {
-    /// Of each focal length, px.
-    pub focal_px: f64,
-    /// Of each coordinate of a principal point, px.
-    pub principal_point_px: f64,
-    /// Of each axis of the rotation between the cameras, rad.
-    pub rotation_rad: f64,
-    /// Of each axis of the translation between the cameras, m.
-    pub translation_m: f64,
+/// How well a rig's parameters are known.
+#[derive(Clone, Debug, PartialEq)]
+pub enum RigUncertainty {
+    /// 1 σ of the parameters, each taken as independent of the others.
+    Sigmas {
+        /// Of each focal length, px.
+        focal_px: f64,
+        /// Of each coordinate of a principal point, px.
+        principal_point_px: f64,
+        /// Of each axis of the rotation between the cameras, rad.
+        rotation_rad: f64,
+        /// Of each axis of the translation between the cameras, m.
+        translation_m: f64,
+    },
+    /// All parameters together, distortion included.
+    Covariance {
+        /// The file that it stands in, as the rig file names it.
+        file: PathBuf,
+        /// The matrix.
+        covariance: Box<RigCovariance>,
+    },
 }
 
 impl StereoRig {

@@ -1,10 +1,11 @@
 //! `rig.toml`: a rig as a file, read with every value checked, and written.
 
+use super::rig_parameters::read_rig_covariance;
 use super::{Camera, Distortion, RigUncertainty, StereoRig, so3};
 use crate::toml_file::{TomlError, TomlText};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
-use std::path::Path;
+use std::path::{Path, PathBuf};
 
 /// Why a rig file cannot be used.
 pub type RigFileError = TomlError;
@@ -66,10 +67,16 @@ struct MountingTable {
 #[derive(Deserialize, Serialize)]
 #[serde(deny_unknown_fields)]
 struct UncertaintyTable {
-    focal_px: f64,
-    principal_point_px: f64,
-    rotation_rad: f64,
-    translation_m: f64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    focal_px: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    principal_point_px: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rotation_rad: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    translation_m: Option<f64>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    covariance: Option<PathBuf>,
 }
 
 /// Longest image side that a rig may have, px.
@@ -81,7 +88,8 @@ const MAX_SIDE_PX: u32 = 16_384;
 /// The file cannot be read, is not TOML, has an unknown or missing key, or a value that no rig can
 /// have; with the line and the key where there is one.
 pub fn load_rig(path: &Path) -> Result<StereoRig, RigFileError> {
-    checked(&TomlText::read(path)?)
+    let folder = path.parent().unwrap_or(Path::new(""));
+    checked(&TomlText::read(path)?, folder)
 }
 
 /// Reads a rig from a text.
@@ -89,10 +97,10 @@ pub fn load_rig(path: &Path) -> Result<StereoRig, RigFileError> {
 /// # Errors
 /// As [`load_rig`].
 pub fn parse_rig(text: &str) -> Result<StereoRig, RigFileError> {
-    checked(&TomlText::new("rig", text))
+    checked(&TomlText::new("rig", text), Path::new(""))
 }
 
-fn checked(text: &TomlText) -> Result<StereoRig, RigFileError> {
+fn checked(text: &TomlText, folder: &Path) -> Result<StereoRig, RigFileError> {
     let file: RigFile = text.parse()?;
     let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
         Some(bad) => Err(text.wrong(key, format!("must be finite, but holds {bad}"))),
@@ -126,34 +134,7 @@ fn checked(text: &TomlText) -> Result<StereoRig, RigFileError> {
         }
     };
 
-    let uncertainty = match &file.uncertainty {
-        None => None,
-        Some(u) => {
-            for (key, sigma) in [
-                ("uncertainty.focal_px", u.focal_px),
-                ("uncertainty.principal_point_px", u.principal_point_px),
-                ("uncertainty.rotation_rad", u.rotation_rad),
-                ("uncertainty.translation_m", u.translation_m),
-            ] {
-                if !(sigma.is_finite() && sigma >= 0.0) {
-                    return Err(text.wrong(
-                        key,
-                        format!(
-                            "a standard deviation must be finite and not negative, but is {sigma}"
-                        ),
-                    ));
-                }
-            }
-            Some(RigUncertainty {
-                focal_px: u.focal_px,
-                principal_point_px: u.principal_point_px,
-                rotation_rad: u.rotation_rad,
-                translation_m: u.translation_m,
-            })
-        }
-    };
-
-    Ok(StereoRig {
+    let mut rig = StereoRig {
         left: camera(text, "left", &file.left)?,
         right: camera(text, "right", &file.right)?,
         right_from_left: Isometry3::from_parts(
@@ -161,7 +142,61 @@ fn checked(text: &TomlText) -> Result<StereoRig, RigFileError> {
             so3::exp(&Vector3::from(extrinsics.rotation_vector_rad)),
         ),
         base_from_camera,
-        uncertainty,
+        uncertainty: None,
+    };
+    if let Some(table) = &file.uncertainty {
+        rig.uncertainty = Some(uncertainty(text, &rig, table, folder)?);
+    }
+    Ok(rig)
+}
+
+/// The stated standard deviations, or the covariance from its file.
+fn uncertainty(
+    text: &TomlText,
+    rig: &StereoRig,
+    table: &UncertaintyTable,
+    folder: &Path,
+) -> Result<RigUncertainty, RigFileError> {
+    let sigmas = [
+        ("focal_px", table.focal_px),
+        ("principal_point_px", table.principal_point_px),
+        ("rotation_rad", table.rotation_rad),
+        ("translation_m", table.translation_m),
+    ];
+    let key = |name: &str| format!("uncertainty.{name}");
+    if let Some(file) = &table.covariance {
+        if let Some((name, _)) = sigmas.iter().find(|(_, sigma)| sigma.is_some()) {
+            return Err(text.wrong(
+                &key(name),
+                "stands beside `covariance`, which holds all parameters: only one of the two may",
+            ));
+        }
+        let covariance = read_rig_covariance(rig, &folder.join(file))
+            .map_err(|cause| text.wrong(&key("covariance"), cause))?;
+        return Ok(RigUncertainty::Covariance {
+            file: file.clone(),
+            covariance: Box::new(covariance),
+        });
+    }
+    let mut values = [0.0; 4];
+    for ((name, sigma), value) in sigmas.into_iter().zip(&mut values) {
+        *value = match sigma {
+            Some(sigma) if sigma.is_finite() && sigma >= 0.0 => sigma,
+            Some(sigma) => {
+                return Err(text.wrong(
+                    &key(name),
+                    format!("a standard deviation must be finite and not negative, but is {sigma}"),
+                ));
+            }
+            None => return Err(text.wrong("uncertainty", format!("missing field `{name}`"))),
+        };
+    }
+    let [focal_px, principal_point_px, rotation_rad, translation_m] = values;
+    Ok(RigUncertainty::Sigmas {
+        focal_px,
+        principal_point_px,
+        rotation_rad,
+        translation_m,
     })
 }
 
@@ -244,15 +279,34 @@ pub fn rig_to_toml(rig: &StereoRig) -> String {
                 rotation_rpy_rad: [roll, pitch, yaw],
             }
         }),
-        uncertainty: rig.uncertainty.map(|u| UncertaintyTable {
-            focal_px: u.focal_px,
-            principal_point_px: u.principal_point_px,
-            rotation_rad: u.rotation_rad,
-            translation_m: u.translation_m,
-        }),
+        uncertainty: rig.uncertainty.as_ref().map(uncertainty_table),
     };
     // A tree of numbers and short strings always has a TOML form.
     toml::to_string(&file).unwrap_or_default()
+}
+
+fn uncertainty_table(uncertainty: &RigUncertainty) -> UncertaintyTable {
+    match uncertainty {
+        RigUncertainty::Sigmas {
+            focal_px,
+            principal_point_px,
+            rotation_rad,
+            translation_m,
+        } => UncertaintyTable {
+            focal_px: Some(*focal_px),
+            principal_point_px: Some(*principal_point_px),
+            rotation_rad: Some(*rotation_rad),
+            translation_m: Some(*translation_m),
+            covariance: None,
+        },
+        RigUncertainty::Covariance { file, .. } => UncertaintyTable {
+            focal_px: None,
+            principal_point_px: None,
+            rotation_rad: None,
+            translation_m: None,
+            covariance: Some(file.clone()),
+        },
+    }
 }
 
 fn camera_table(camera: &Camera) -> CameraTable {

@@ -110,6 +110,13 @@ pub fn error_fixed_axes(estimate: &Isometry3<f64>, truth: &Isometry3<f64>) -> Ve
     )
 }
 
+/// Takes out what rounding did to the quaternion's length.
+#[must_use]
+pub fn renormalised(mut a_from_b: Isometry3<f64>) -> Isometry3<f64> {
+    a_from_b.rotation.renormalize();
+    a_from_b
+}
+
 /// The mean of a matrix and its transpose: takes out what rounding broke.
 #[must_use]
 pub fn symmetric(m: &Matrix6<f64>) -> Matrix6<f64> {

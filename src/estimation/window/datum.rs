@@ -36,9 +36,7 @@ impl Datum {
     pub(super) fn pose(&self, x: &DVector<f64>) -> Isometry3<f64> {
         let known = self.by_window.ncols().min(x.len());
         let by_window: Vector6<f64> = self.by_window.columns(0, known) * x.rows(0, known);
-        let mut pose = self.odom_from_linearised * se3::exp(&(by_window + self.offset));
-        pose.rotation.renormalize();
-        pose
+        se3::renormalised(self.odom_from_linearised * se3::exp(&(by_window + self.offset)))
     }
 
     /// The covariance (right perturbation) of the pose of the last frame in the window, which
@@ -99,7 +97,7 @@ impl Datum {
             }
         }
         by_window += by_first * by_rest;
-        self.odom_from_linearised *= linearised;
+        self.odom_from_linearised = se3::renormalised(self.odom_from_linearised * linearised);
         self.offset = by_first * mean + carry * self.offset;
         self.cov = se3::symmetric(
             &(by_first * cov_first * by_first.transpose() + carry * self.cov * carry.transpose()),

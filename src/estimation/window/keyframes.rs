@@ -8,7 +8,7 @@ impl Window {
     /// Makes the newest frame a keyframe, `new` what it sees for the first time. Where the window
     /// is full its oldest keyframe is marginalised.
     ///
-    /// Ids must be larger than any before and rise.
+    /// None of `new` may be a landmark that the window holds.
     pub fn promote(&mut self, new: &[Seen]) {
         let Some(newest) = self.frames.last().map(|f| f.serial) else {
             return;
@@ -26,6 +26,8 @@ impl Window {
                 &calibrated,
             ));
         }
+        // An id may come back after its landmark was given up.
+        self.landmarks.sort_by_key(|l| l.id);
         let seen = self
             .landmarks
             .iter()
@@ -161,9 +163,12 @@ impl Window {
         self.frames.remove(0);
         let last = self.frames.len() - 1;
         for (i, frame) in self.frames.iter_mut().enumerate() {
-            let linearised = first_linearised.inverse() * frame.datum_from_linearised();
+            // Renormalised, or what rounding does to the quaternions' length would double with every
+            // keyframe that leaves.
+            let linearised =
+                se3::renormalised(first_linearised.inverse() * frame.datum_from_linearised());
             frame.linearised = (0 < i && i < last).then_some(linearised);
-            frame.datum_from_frame = first.inverse() * frame.datum_from_frame;
+            frame.datum_from_frame = se3::renormalised(first.inverse() * frame.datum_from_frame);
         }
         self.frames[0].datum_from_frame = Isometry3::identity();
     }

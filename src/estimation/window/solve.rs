@@ -102,7 +102,7 @@ impl Window {
         let serial = self.take_serial();
         self.frames.push(Frame {
             serial,
-            datum_from_frame: newest * newest_from_now,
+            datum_from_frame: se3::renormalised(newest * newest_from_now),
             linearised: None,
             is_keyframe: false,
             landmarks: 0,
@@ -246,14 +246,14 @@ impl Window {
         for (i, frame) in self.frames.iter_mut().enumerate().skip(1) {
             let x: Vector6<f64> = step.fixed_rows::<6>(row_of(i)).into_owned();
             // Counted from where Jacobians are taken, so that steps add up as the prior counts them.
-            frame.datum_from_frame = match &frame.linearised {
+            let moved = match &frame.linearised {
                 Some(linearised) => {
                     let offset = se3::log(&(linearised.inverse() * frame.datum_from_frame));
                     linearised * se3::exp(&(offset + x))
                 }
                 None => frame.datum_from_frame * se3::exp(&x),
             };
-            frame.datum_from_frame.rotation.renormalize();
+            frame.datum_from_frame = se3::renormalised(moved);
         }
     }
 

@@ -7,9 +7,11 @@
 //! seems to shrink or grow as the robot moves; there one constant is all that can be told from
 //! other errors. What is not known of either goes into the covariance of every pose.
 
-use super::super::{Settings, StereoMeasurement};
+use super::super::calibration::sight_by_rig;
+use super::super::{Settings, StereoMeasurement, seen_at};
 use crate::geometry::StereoRig;
-use nalgebra::{DVector, SMatrix, SVector, Vector2};
+use crate::geometry::rig_parameters::RIG_PARAMETERS;
+use nalgebra::{DVector, Isometry3, SMatrix, SVector, Vector2, Vector4};
 
 /// Terms across the baseline: 1, x, y, x², xy, y².
 const TERMS: usize = 6;
@@ -18,6 +20,9 @@ pub(super) const WARP: usize = 1 + TERMS;
 
 /// Derivative of the displacement, px, by the unknowns.
 pub(super) type ByWarp = SMatrix<f64, 2, WARP>;
+
+/// A covariance of all unknowns, px².
+pub(super) type WarpCovariance = SMatrix<f64, WARP, WARP>;
 
 /// A displacement of the right image.
 #[derive(Clone, Debug, PartialEq)]
@@ -74,31 +79,50 @@ impl Warp {
     }
 }
 
-/// The covariance of the warp before anything is seen: from what the rig states of itself, else
-/// what the settings suppose of each coefficient.
-pub(super) fn prior_covariance(rig: &StereoRig, settings: &Settings) -> SMatrix<f64, WARP, WARP> {
-    let sigmas_px =
-        stated_sigmas_px(rig).unwrap_or_else(|| SVector::repeat(settings.calibration_sigma_px));
-    SMatrix::from_diagonal(&sigmas_px.map(|s| (s * s).max(SMALLEST_VARIANCE_PX2)))
+/// The covariance of the warp before anything is seen: what the rig's stated uncertainty does to
+/// the right image, else what the settings suppose of each coefficient.
+pub(super) fn prior_covariance(rig: &StereoRig, settings: &Settings) -> WarpCovariance {
+    let floor = WarpCovariance::identity() * SMALLEST_VARIANCE_PX2;
+    let supposed = settings.calibration_sigma_px * settings.calibration_sigma_px;
+    stated_covariance(rig).unwrap_or_else(|| WarpCovariance::identity() * supposed) + floor
 }
 
 /// Keeps the information finite where a calibration is taken as exact.
 const SMALLEST_VARIANCE_PX2: f64 = 1e-12;
 
-/// What the uncertainties of rotation, principal points and focal lengths do to the right image, to
-/// second order in the position.
-fn stated_sigmas_px(rig: &StereoRig) -> Option<SVector<f64, WARP>> {
-    let stated = rig.uncertainty.as_ref()?;
-    let focal_px = rig.right.focal_px.x;
-    let tangent = 0.5 * f64::from(rig.right.width) / focal_px;
-    let turn_px = stated.rotation_rad * focal_px;
-    let both = |sigma: f64| sigma * std::f64::consts::SQRT_2;
-    let offset = turn_px.hypot(both(stated.principal_point_px));
-    let stretch = both(stated.focal_px) * tangent;
-    let roll = turn_px * tangent;
-    // A turn about the image's vertical lifts by xy, one about its horizontal by y².
-    let keystone = turn_px * tangent * tangent;
-    Some(SVector::from([
-        offset, offset, roll, stretch, 0.0, keystone, keystone,
-    ]))
+/// Positions across and down the image at which the warp is fitted to what parameters do.
+const GRID: usize = 5;
+
+/// The warp that fits best to what errors of the rig's parameters do to points at infinity: their
+/// displacement on the right, less the one on the left.
+fn stated_covariance(rig: &StereoRig) -> Option<WarpCovariance> {
+    let covariance = rig.covariance()?;
+    let warp = Warp::new(rig);
+    let mut normal = WarpCovariance::zeros();
+    let mut by_rig = SMatrix::<f64, WARP, RIG_PARAMETERS>::zeros();
+    for i in 0..GRID * GRID {
+        let share = |n: usize| (n as f64 + 0.5) / GRID as f64;
+        let left_px = Vector2::new(
+            share(i % GRID) * f64::from(rig.left.width),
+            share(i / GRID) * f64::from(rig.left.height),
+        );
+        let Some(ray) = rig.left.unproject(&left_px) else {
+            continue;
+        };
+        let infinity = ray.push(0.0);
+        let identity = Isometry3::identity();
+        let (Some(px), Some(by)) = (
+            seen_at(rig, &identity, &infinity),
+            sight_by_rig(rig, &identity, &infinity),
+        ) else {
+            continue;
+        };
+        let sigma_px = Vector4::zeros();
+        let by_warp = warp.derivative(&StereoMeasurement { px, sigma_px });
+        normal += by_warp.transpose() * by_warp;
+        by_rig += by_warp.transpose() * (by.fixed_rows::<2>(2) - by.fixed_rows::<2>(0));
+    }
+    let by_rig = normal.try_inverse()? * by_rig;
+    let stated = by_rig * covariance * by_rig.transpose();
+    Some((stated + stated.transpose()) * 0.5)
 }

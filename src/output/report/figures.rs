@@ -8,19 +8,19 @@ use super::svg;
 use crate::estimation::Status;
 
 /// Width of every drawing, px.
-pub(super) const WIDTH_PX: f64 = 960.0;
-pub(super) const LEFT_PX: f64 = 76.0;
-pub(super) const RIGHT_PX: f64 = 16.0;
-pub(super) const TOP_PX: f64 = 8.0;
+pub(crate) const WIDTH_PX: f64 = 960.0;
+pub(crate) const LEFT_PX: f64 = 76.0;
+pub(crate) const RIGHT_PX: f64 = 16.0;
+pub(crate) const TOP_PX: f64 = 8.0;
 pub(super) const HEIGHT_PX: f64 = 200.0;
 /// Below a panel that shows its x axis.
-pub(super) const BELOW_PX: f64 = 48.0;
+pub(crate) const BELOW_PX: f64 = 48.0;
 pub(super) const TIME_LABEL: &str = "time since the first pair, s";
 /// Classes of the lines x, y, z: they differ in colour and in dashes.
 const LINES: [&str; 3] = ["one", "two", "three"];
 
 /// A drawing with its words.
-pub(super) struct Figure {
+pub(crate) struct Figure {
     pub title: String,
     /// What it shows, in a sentence or two.
     pub sentence: String,
@@ -29,7 +29,7 @@ pub(super) struct Figure {
 }
 
 /// An entry of a legend.
-pub(super) struct Key {
+pub(crate) struct Key {
     pub class: String,
     pub mark: Mark,
     pub words: String,
@@ -37,7 +37,7 @@ pub(super) struct Key {
 
 /// What an entry's sample looks like.
 #[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Mark {
+pub(crate) enum Mark {
     Line,
     Area,
     Dot,
@@ -52,15 +52,15 @@ impl Key {
         }
     }
 
-    pub(super) fn line(class: &str, words: &str) -> Self {
+    pub(crate) fn line(class: &str, words: &str) -> Self {
         Self::new(Mark::Line, class, words)
     }
 
-    pub(super) fn area(class: &str, words: &str) -> Self {
+    pub(crate) fn area(class: &str, words: &str) -> Self {
         Self::new(Mark::Area, class, words)
     }
 
-    pub(super) fn dot(class: &str, words: &str) -> Self {
+    pub(crate) fn dot(class: &str, words: &str) -> Self {
         Self::new(Mark::Dot, class, words)
     }
 }

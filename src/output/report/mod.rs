@@ -12,13 +12,13 @@
 
 mod against_truth;
 mod facts;
-mod figures;
+pub(crate) mod figures;
 mod map;
-mod page;
-mod plot;
+pub(crate) mod page;
+pub(crate) mod plot;
 mod run;
-mod scale;
-mod svg;
+pub(crate) mod scale;
+pub(crate) mod svg;
 #[cfg(test)]
 mod tests;
 

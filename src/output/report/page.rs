@@ -6,8 +6,13 @@ use super::run::Run;
 use super::svg::escape;
 use std::fmt::Write as _;
 
+/// What pages and drawings look like, in light and dark and on paper.
+pub(crate) const STYLE: &str = include_str!("style.css");
+/// Zoom and pan, for those who want it.
+pub(crate) const SCRIPT: &str = include_str!("script.js");
+
 /// Hatchings, so that states differ without colour.
-const PATTERNS: &str = r#"<svg class="patterns" aria-hidden="true"><defs>
+pub(crate) const PATTERNS: &str = r#"<svg class="patterns" aria-hidden="true"><defs>
 <pattern id="degraded" width="7" height="7" patternUnits="userSpaceOnUse"><rect class="warn" width="7" height="7"/><path class="ink" d="M-1,8L8,-1M-1,1L1,-1M6,8L8,6"/></pattern>
 <pattern id="lost" width="7" height="7" patternUnits="userSpaceOnUse"><rect class="bad" width="7" height="7"/><path class="ink" d="M0,0L7,7M7,0L0,7"/></pattern>
 </defs></svg>
@@ -26,7 +31,7 @@ pub(super) fn page(title: &str, run: &Run, figures: &[Figure]) -> String {
          <style>\n{style}</style>\n</head>\n<body>\n{PATTERNS}<header>\n<h1>{title}</h1>\n\
          <p class=\"summary\">{summary}</p>\n</header>\n",
         version = env!("CARGO_PKG_VERSION"),
-        style = include_str!("style.css"),
+        style = STYLE,
         summary = escape(&summary(run)),
     );
     push_facts(&mut out, run);
@@ -48,7 +53,7 @@ pub(super) fn page(title: &str, run: &Run, figures: &[Figure]) -> String {
          3 σ ellipse 98.9 % of Gaussian errors. Written by visod {}.</p>\n</footer>\n\
          <script>\n{}</script>\n</body>\n</html>\n",
         env!("CARGO_PKG_VERSION"),
-        include_str!("script.js")
+        SCRIPT
     );
     out
 }
@@ -71,7 +76,7 @@ fn push_facts(out: &mut String, run: &Run) {
     out.push_str("</dl>\n");
 }
 
-fn push_figure(out: &mut String, figure: &Figure) {
+pub(crate) fn push_figure(out: &mut String, figure: &Figure) {
     let _ = write!(
         out,
         "<figure>\n<figcaption>\n<h2>{}</h2>\n<p>{}</p>\n<ul class=\"legend\">\n",
@@ -89,7 +94,7 @@ fn push_figure(out: &mut String, figure: &Figure) {
 }
 
 /// What an entry of the legend looks like in the figure.
-fn sample(key: &Key) -> String {
+pub(crate) fn sample(key: &Key) -> String {
     let shape = match key.mark {
         Mark::Line => "<line class=\"CLASS\" x1=\"2\" y1=\"7\" x2=\"32\" y2=\"7\"/>",
         Mark::Area => "<rect class=\"CLASS\" x=\"2\" y=\"1\" width=\"30\" height=\"12\"/>",

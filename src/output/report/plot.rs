@@ -8,7 +8,7 @@ const MOST_POINTS: usize = 6000;
 
 /// Where on the drawing a panel's data area lies, px.
 #[derive(Clone, Copy, Debug)]
-pub(super) struct Frame {
+pub(crate) struct Frame {
     pub left: f64,
     pub top: f64,
     pub width: f64,
@@ -16,7 +16,7 @@ pub(super) struct Frame {
 }
 
 /// A data area with two axes, and what was drawn into it.
-pub(super) struct Panel {
+pub(crate) struct Panel {
     frame: Frame,
     x: Scale,
     y: Scale,
@@ -25,13 +25,13 @@ pub(super) struct Panel {
 
 impl Panel {
     /// A linear panel over given domains.
-    pub(super) fn new(frame: Frame, x: (f64, f64), y: (f64, f64)) -> Self {
+    pub(crate) fn new(frame: Frame, x: (f64, f64), y: (f64, f64)) -> Self {
         let y = Scale::linear(y, (frame.top + frame.height, frame.top));
         Self::with_y(frame, x, y)
     }
 
     /// A panel whose y axis is logarithmic.
-    pub(super) fn logarithmic(frame: Frame, x: (f64, f64), y: (f64, f64)) -> Self {
+    pub(crate) fn logarithmic(frame: Frame, x: (f64, f64), y: (f64, f64)) -> Self {
         let y = Scale::logarithmic(y, (frame.top + frame.height, frame.top));
         Self::with_y(frame, x, y)
     }
@@ -42,7 +42,7 @@ impl Panel {
     }
 
     /// A panel over given scales.
-    pub(super) fn with_scales(frame: Frame, x: Scale, y: Scale) -> Self {
+    pub(crate) fn with_scales(frame: Frame, x: Scale, y: Scale) -> Self {
         Self {
             frame,
             x,
@@ -52,12 +52,12 @@ impl Panel {
     }
 
     /// Puts elements into the panel.
-    pub(super) fn draw(&mut self, elements: &str) {
+    pub(crate) fn draw(&mut self, elements: &str) {
         self.content.push_str(elements);
     }
 
     /// A line through points; what is not finite leaves a gap.
-    pub(super) fn line(&mut self, points: &[(f64, f64)], class: &str) {
+    pub(crate) fn line(&mut self, points: &[(f64, f64)], class: &str) {
         let mut path = PathData::default();
         for (x, y) in thin_out(points) {
             path.to(self.x.at(x), self.inside(self.y.at(y)));
@@ -66,7 +66,7 @@ impl Panel {
     }
 
     /// The area between two curves: points are x, low, high.
-    pub(super) fn band(&mut self, points: &[(f64, f64, f64)], class: &str) {
+    pub(crate) fn band(&mut self, points: &[(f64, f64, f64)], class: &str) {
         let is_good = |p: &&(f64, f64, f64)| p.0.is_finite() && p.1.is_finite() && p.2.is_finite();
         let mut path = PathData::default();
         for run in points.split(|p| !is_good(&p)) {
@@ -83,7 +83,7 @@ impl Panel {
     }
 
     /// The area between two values, from end to end.
-    pub(super) fn level_band(&mut self, low: f64, high: f64, class: &str) {
+    pub(crate) fn level_band(&mut self, low: f64, high: f64, class: &str) {
         let (top, bottom) = (self.inside(self.y.at(high)), self.inside(self.y.at(low)));
         let Frame { left, width, .. } = self.frame;
         self.content
@@ -91,7 +91,7 @@ impl Panel {
     }
 
     /// A line at one value, from end to end.
-    pub(super) fn level(&mut self, y: f64, class: &str) {
+    pub(crate) fn level(&mut self, y: f64, class: &str) {
         let y = self.y.at(y);
         let Frame { left, width, .. } = self.frame;
         self.content
@@ -99,7 +99,7 @@ impl Panel {
     }
 
     /// A dot a point.
-    pub(super) fn dots(&mut self, points: &[(f64, f64)], radius: f64, class: &str) {
+    pub(crate) fn dots(&mut self, points: &[(f64, f64)], radius: f64, class: &str) {
         for &(x, y) in points {
             let (x, y) = (self.x.at(x), self.inside(self.y.at(y)));
             self.content.push_str(&dot(x, y, radius, class));
@@ -107,7 +107,7 @@ impl Panel {
     }
 
     /// A bar from one x to another over the whole height.
-    pub(super) fn span(&mut self, from: f64, to: f64, class: &str) {
+    pub(crate) fn span(&mut self, from: f64, to: f64, class: &str) {
         let (left, right) = (self.x.at(from), self.x.at(to));
         if left.is_finite() && right.is_finite() {
             let Frame { top, height, .. } = self.frame;
@@ -119,7 +119,7 @@ impl Panel {
 
     /// The finished panel: grid below, content, axes with labels. Without `x_label` the panel is
     /// one of a stack and shows no numbers below.
-    pub(super) fn finish(self, y_label: &str, x_label: Option<&str>) -> String {
+    pub(crate) fn finish(self, y_label: &str, x_label: Option<&str>) -> String {
         let Frame {
             left,
             top,
@@ -152,7 +152,7 @@ impl Panel {
     }
 
     /// The finished panel without a y axis.
-    pub(super) fn finish_strip(self, x_label: &str) -> String {
+    pub(crate) fn finish_strip(self, x_label: &str) -> String {
         let Frame {
             left,
             top,

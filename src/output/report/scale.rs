@@ -2,7 +2,7 @@
 
 /// Maps values to px, linearly or by their logarithm.
 #[derive(Clone, Debug)]
-pub(super) struct Scale {
+pub(crate) struct Scale {
     /// Values at the ends; of a logarithmic scale both positive.
     domain: (f64, f64),
     /// Places of these, px.
@@ -12,7 +12,7 @@ pub(super) struct Scale {
 
 impl Scale {
     /// Linear from `domain` to `range`; a domain without extent is given some.
-    pub(super) fn linear(domain: (f64, f64), range: (f64, f64)) -> Self {
+    pub(crate) fn linear(domain: (f64, f64), range: (f64, f64)) -> Self {
         let (mut low, mut high) = match domain.0.is_finite() && domain.1.is_finite() {
             true => domain,
             false => (0.0, 1.0),
@@ -30,7 +30,7 @@ impl Scale {
     }
 
     /// Logarithmic, both ends of `domain` positive.
-    pub(super) fn logarithmic(domain: (f64, f64), range: (f64, f64)) -> Self {
+    pub(crate) fn logarithmic(domain: (f64, f64), range: (f64, f64)) -> Self {
         let low = domain.0.max(1e-12);
         Self {
             domain: (low, domain.1.max(10.0 * low)),
@@ -40,7 +40,7 @@ impl Scale {
     }
 
     /// The place of a value, px; not a number where the value has none.
-    pub(super) fn at(&self, value: f64) -> f64 {
+    pub(crate) fn at(&self, value: f64) -> f64 {
         let (low, high) = self.domain;
         let share = if self.logarithmic {
             (value / low).ln() / (high / low).ln()
@@ -51,12 +51,12 @@ impl Scale {
     }
 
     /// The places at the ends, px.
-    pub(super) fn range(&self) -> (f64, f64) {
+    pub(crate) fn range(&self) -> (f64, f64) {
         self.range
     }
 
     /// About `count` round values with what to write beside them.
-    pub(super) fn ticks(&self, count: usize) -> Vec<(f64, String)> {
+    pub(crate) fn ticks(&self, count: usize) -> Vec<(f64, String)> {
         if self.logarithmic {
             return self.decades();
         }
@@ -94,7 +94,7 @@ impl Scale {
 }
 
 /// 1, 2 or 5 times a power of ten, at least `least`.
-pub(super) fn round_step(least: f64) -> f64 {
+pub(crate) fn round_step(least: f64) -> f64 {
     let power = 10_f64.powf(least.log10().floor());
     [1.0, 2.0, 5.0, 10.0]
         .into_iter()
@@ -104,7 +104,7 @@ pub(super) fn round_step(least: f64) -> f64 {
 }
 
 /// A number with so many decimals, a real minus sign and no minus zero.
-pub(super) fn number(value: f64, decimals: usize) -> String {
+pub(crate) fn number(value: f64, decimals: usize) -> String {
     let text = format!("{value:.decimals$}");
     let is_zero = text.bytes().all(|b| matches!(b, b'-' | b'0' | b'.'));
     match text.strip_prefix('-') {
@@ -115,7 +115,7 @@ pub(super) fn number(value: f64, decimals: usize) -> String {
 }
 
 /// Three significant digits or so, as a person would write the number.
-pub(super) fn brief(value: f64) -> String {
+pub(crate) fn brief(value: f64) -> String {
     if !value.is_finite() {
         return "–".to_owned();
     }
@@ -130,7 +130,7 @@ pub(super) fn brief(value: f64) -> String {
 }
 
 /// A unit for values as large as `largest`: its name and how many there are in the base unit.
-pub(super) fn length_unit(largest_m: f64) -> (&'static str, f64) {
+pub(crate) fn length_unit(largest_m: f64) -> (&'static str, f64) {
     match largest_m {
         m if m < 0.1 => ("mm", 1e3),
         m if m < 1.0 => ("cm", 1e2),
@@ -140,7 +140,7 @@ pub(super) fn length_unit(largest_m: f64) -> (&'static str, f64) {
 }
 
 /// The same of angles in rad.
-pub(super) fn angle_unit(largest_rad: f64) -> (&'static str, f64) {
+pub(crate) fn angle_unit(largest_rad: f64) -> (&'static str, f64) {
     match largest_rad.to_degrees() {
         d if d < 0.5 => ("mdeg", 1e3_f64.to_degrees()),
         _ => ("deg", 1_f64.to_degrees()),
@@ -148,7 +148,7 @@ pub(super) fn angle_unit(largest_rad: f64) -> (&'static str, f64) {
 }
 
 /// The smallest and largest of finite values.
-pub(super) fn extent(values: impl IntoIterator<Item = f64>) -> Option<(f64, f64)> {
+pub(crate) fn extent(values: impl IntoIterator<Item = f64>) -> Option<(f64, f64)> {
     values
         .into_iter()
         .filter(|v| v.is_finite())

@@ -3,7 +3,7 @@
 use std::fmt::Write as _;
 
 /// Text as it may stand in HTML and SVG, attributes included.
-pub(super) fn escape(text: &str) -> String {
+pub(crate) fn escape(text: &str) -> String {
     let mut out = String::with_capacity(text.len());
     for c in text.chars() {
         match c {
@@ -21,7 +21,7 @@ pub(super) fn escape(text: &str) -> String {
 }
 
 /// A coordinate, px, to a tenth; far outside the drawing it stays at a distance that viewers bear.
-pub(super) fn px(value: f64) -> String {
+pub(crate) fn px(value: f64) -> String {
     let text = format!("{:.1}", value.clamp(-1e5, 1e5));
     match text.strip_suffix(".0") {
         Some("-0") => "0".to_owned(),
@@ -32,7 +32,7 @@ pub(super) fn px(value: f64) -> String {
 
 /// The `d` of a path under construction. A point that is not finite lifts the pen.
 #[derive(Default)]
-pub(super) struct PathData {
+pub(crate) struct PathData {
     d: String,
     drawing: bool,
     last: Option<(String, String)>,
@@ -40,7 +40,7 @@ pub(super) struct PathData {
 
 impl PathData {
     /// Draws on to a point, px.
-    pub(super) fn to(&mut self, x: f64, y: f64) {
+    pub(crate) fn to(&mut self, x: f64, y: f64) {
         if !(x.is_finite() && y.is_finite()) {
             self.lift();
             return;
@@ -61,12 +61,12 @@ impl PathData {
     }
 
     /// Begins a new line with the next point.
-    pub(super) fn lift(&mut self) {
+    pub(crate) fn lift(&mut self) {
         self.drawing = false;
     }
 
     /// Closes the outline drawn so far.
-    pub(super) fn close(&mut self) {
+    pub(crate) fn close(&mut self) {
         if self.drawing {
             self.d.push('Z');
         }
@@ -74,7 +74,7 @@ impl PathData {
     }
 
     /// The element; nothing if nothing was drawn.
-    pub(super) fn element(&self, class: &str) -> String {
+    pub(crate) fn element(&self, class: &str) -> String {
         if self.d.is_empty() {
             return String::new();
         }
@@ -83,7 +83,7 @@ impl PathData {
 }
 
 /// A straight line, px.
-pub(super) fn line(from: (f64, f64), to: (f64, f64), class: &str) -> String {
+pub(crate) fn line(from: (f64, f64), to: (f64, f64), class: &str) -> String {
     format!(
         "<line class=\"{class}\" x1=\"{}\" y1=\"{}\" x2=\"{}\" y2=\"{}\"/>\n",
         px(from.0),
@@ -94,7 +94,7 @@ pub(super) fn line(from: (f64, f64), to: (f64, f64), class: &str) -> String {
 }
 
 /// A rectangle, px.
-pub(super) fn rect(left: f64, top: f64, width: f64, height: f64, class: &str) -> String {
+pub(crate) fn rect(left: f64, top: f64, width: f64, height: f64, class: &str) -> String {
     format!(
         "<rect class=\"{class}\" x=\"{}\" y=\"{}\" width=\"{}\" height=\"{}\"/>\n",
         px(left),
@@ -105,7 +105,7 @@ pub(super) fn rect(left: f64, top: f64, width: f64, height: f64, class: &str) ->
 }
 
 /// A dot, px.
-pub(super) fn dot(x: f64, y: f64, radius: f64, class: &str) -> String {
+pub(crate) fn dot(x: f64, y: f64, radius: f64, class: &str) -> String {
     if !(x.is_finite() && y.is_finite()) {
         return String::new();
     }
@@ -118,7 +118,7 @@ pub(super) fn dot(x: f64, y: f64, radius: f64, class: &str) -> String {
 }
 
 /// A text at a point, px; `class` says how it is anchored.
-pub(super) fn text(x: f64, y: f64, class: &str, text: &str) -> String {
+pub(crate) fn text(x: f64, y: f64, class: &str, text: &str) -> String {
     format!(
         "<text class=\"{class}\" x=\"{}\" y=\"{}\">{}</text>\n",
         px(x),
@@ -128,7 +128,7 @@ pub(super) fn text(x: f64, y: f64, class: &str, text: &str) -> String {
 }
 
 /// A text that reads upwards.
-pub(super) fn text_up(x: f64, y: f64, class: &str, text: &str) -> String {
+pub(crate) fn text_up(x: f64, y: f64, class: &str, text: &str) -> String {
     format!(
         "<text class=\"{class}\" transform=\"translate({} {}) rotate(-90)\">{}</text>\n",
         px(x),
@@ -138,7 +138,7 @@ pub(super) fn text_up(x: f64, y: f64, class: &str, text: &str) -> String {
 }
 
 /// The drawing itself; `label` is what a screen reader says of it.
-pub(super) fn drawing(width: f64, height: f64, label: &str, content: &str) -> String {
+pub(crate) fn drawing(width: f64, height: f64, label: &str, content: &str) -> String {
     format!(
         "<svg class=\"plot\" viewBox=\"0 0 {} {}\" role=\"img\" aria-label=\"{}\">\n{content}</svg>\n",
         px(width),

@@ -1,0 +1,184 @@
+//! A motion with its tracks in; what an error of the rig's calibration, or of its synchronisation,
+//! does to that motion out.
+//!
+//! To an estimator such an error is a displacement of every pixel: `h(x, c + δc) − h(x, c)`. How
+//! pixels move a motion is known ([`Influence`]); so `δm = Σ (Pᵢ ∂h/∂c before + Qᵢ ∂h/∂c now) δc`,
+//! which is `(JᵀWJ)⁻¹ JᵀW ∂h/∂c` with the points marginalised.
+
+use super::bundle::TrackedPoint;
+use super::influence::Influence;
+use super::sight;
+use crate::geometry::rig_parameters::{
+    CAMERA_PARAMETERS, EXTRINSICS, RIG_PARAMETERS, pixel_by_parameters,
+};
+use crate::geometry::{Camera, StereoRig, product::product, so3};
+use crate::uncertainty::consider::Sensitivity;
+use nalgebra::{Isometry3, Matrix2x3, Point3, SMatrix, Vector2, Vector3, Vector4, Vector6};
+
+/// By how much the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from a rig moved by
+/// `now_from_prev` moves with each parameter of the rig, the point and the motion staying.
+///
+/// `None` where a camera cannot see the point.
+#[must_use]
+pub fn sight_by_rig(
+    rig: &StereoRig,
+    now_from_prev: &Isometry3<f64>,
+    y: &Vector3<f64>,
+) -> Option<SMatrix<f64, 4, RIG_PARAMETERS>> {
+    let left = now_from_prev.rotation * Vector3::new(y.x, y.y, 1.0)
+        + now_from_prev.translation.vector * y.z;
+    let turned = rig.right_from_left.rotation * left;
+    let right = turned + rig.right_from_left.translation.vector * y.z;
+    let (left_by_camera, _) = by_camera(&rig.left, &left)?;
+    let (right_by_camera, right_by_point) = by_camera(&rig.right, &right)?;
+    let mut by = SMatrix::<f64, 4, RIG_PARAMETERS>::zeros();
+    by.fixed_view_mut::<2, CAMERA_PARAMETERS>(0, 0)
+        .copy_from(&left_by_camera);
+    by.fixed_view_mut::<2, CAMERA_PARAMETERS>(2, CAMERA_PARAMETERS)
+        .copy_from(&right_by_camera);
+    by.fixed_view_mut::<2, 3>(2, EXTRINSICS)
+        .copy_from(&(right_by_point * y.z));
+    // exp(r) turns the point before the baseline is added.
+    by.fixed_view_mut::<2, 3>(2, EXTRINSICS + 3)
+        .copy_from(&(right_by_point * -so3::hat(&turned)));
+    Some(by)
+}
+
+/// By how much the same sight moves, px/s, with the time by which the right image is exposed after
+/// the left one, the rig moving with `twist` (camera frame, m/s and rad/s).
+///
+/// `None` where a camera cannot see the point.
+#[must_use]
+pub fn sight_by_skew(
+    rig: &StereoRig,
+    now_from_prev: &Isometry3<f64>,
+    y: &Vector3<f64>,
+    twist: &Vector6<f64>,
+) -> Option<Vector4<f64>> {
+    let seen = sight::linearise(rig, now_from_prev, y)?;
+    let mut by = product(&seen.by_motion, twist);
+    by[0] = 0.0;
+    by[1] = 0.0;
+    Some(by)
+}
+
+fn by_camera(
+    camera: &Camera,
+    point: &Vector3<f64>,
+) -> Option<(SMatrix<f64, 2, CAMERA_PARAMETERS>, Matrix2x3<f64>)> {
+    let (_, by_point) = camera.project_with_jacobian(&Point3::from(*point))?;
+    let normalised = Vector2::new(point.x / point.z, point.y / point.z);
+    Some((pixel_by_parameters(camera, &normalised), by_point))
+}
+
+/// The derivative of a motion by the rig's parameters, and by the skew of its exposures, s.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct MotionSensitivity {
+    /// By the rig's parameters, in the order of [`rig_parameters`](crate::geometry::rig_parameters).
+    pub by_rig: Sensitivity<RIG_PARAMETERS>,
+    /// By the time that the right image is exposed after the left one, s.
+    pub by_skew: Sensitivity<1>,
+}
+
+impl MotionSensitivity {
+    /// That of the pose after one more motion.
+    #[must_use]
+    pub fn chain(&self, prev_from_now: &Isometry3<f64>, motion: &Self) -> Self {
+        Self {
+            by_rig: self.by_rig.chain(prev_from_now, &motion.by_rig),
+            by_skew: self.by_skew.chain(prev_from_now, &motion.by_skew),
+        }
+    }
+}
+
+/// How a motion moves with the rig's errors. `tracks` are those that it rests on with what their
+/// pixels do to it; twists are the camera's velocities at the earlier pair and now, m/s and rad/s.
+///
+/// `None` where a camera cannot see a point.
+#[must_use]
+pub fn of_motion<'a>(
+    rig: &StereoRig,
+    prev_from_now: &Isometry3<f64>,
+    tracks: impl Iterator<Item = (&'a TrackedPoint, &'a Influence)>,
+    twist_prev: &Vector6<f64>,
+    twist_now: &Vector6<f64>,
+) -> Option<MotionSensitivity> {
+    let identity = Isometry3::identity();
+    let now_from_prev = prev_from_now.inverse();
+    let mut by_rig = SMatrix::<f64, 6, RIG_PARAMETERS>::zeros();
+    let mut by_skew = Vector6::zeros();
+    for (point, influence) in tracks {
+        let y = &point.inverse_depth;
+        by_rig += product(&influence.by_prev, &sight_by_rig(rig, &identity, y)?);
+        by_rig += product(&influence.by_now, &sight_by_rig(rig, &now_from_prev, y)?);
+        by_skew += influence.by_prev * sight_by_skew(rig, &identity, y, twist_prev)?;
+        by_skew += influence.by_now * sight_by_skew(rig, &now_from_prev, y, twist_now)?;
+    }
+    Some(MotionSensitivity {
+        by_rig: Sensitivity::new(by_rig),
+        by_skew: Sensitivity::new(SMatrix::from(by_skew)),
+    })
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::seen_at;
+    use crate::geometry::rig_parameters::RigVector;
+    use crate::geometry::{parse_rig, se3};
+    use proptest::prelude::*;
+
+    pub(crate) fn rig() -> StereoRig {
+        parse_rig(
+            "left = { width = 640, height = 480, focal = [885.8, 884.1], principal_point = [313.2, 243.5], distortion = { model = \"radtan\", coefficients = [-0.25, 0.1, 0.0005, -0.0003, 0.01, 0.02, 0.03, 0.01] } }
+             right = { width = 640, height = 480, focal = [882.9, 881.2], principal_point = [300.2, 246.4], distortion = { model = \"equidistant\", coefficients = [-0.01, 0.02, -0.01, 0.002] } }
+             right_from_left = { translation_m = [-0.3857, -0.0072, 0.0001], rotation_vector_rad = [0.04046, 0.01616, 0.01419] }",
+        )
+        .expect("valid")
+    }
+
+    proptest! {
+        #[test]
+        fn sights_move_with_the_rig_as_central_differences_say(
+            x in -0.3..0.3_f64, v in -0.25..0.25_f64, rho in 0.0..0.5_f64,
+            xi in prop::array::uniform6(-0.1..0.1_f64),
+        ) {
+            let rig = rig();
+            let now_from_prev = se3::exp(&Vector6::from(xi));
+            let y = Vector3::new(x, v, rho);
+            let exact = sight_by_rig(&rig, &now_from_prev, &y).expect("in front");
+            for j in 0..RIG_PARAMETERS {
+                // Pixels hardly notice 1e-4 of a focal length, and much of a coefficient.
+                let step = if j < EXTRINSICS && j % CAMERA_PARAMETERS < 4 { 1e-2 } else { 1e-5 };
+                let at = |sign: f64| {
+                    let mut error = RigVector::zeros();
+                    error[j] = sign * step;
+                    seen_at(&rig.with_error(&error), &now_from_prev, &y).expect("in front")
+                };
+                let numeric = (at(1.0) - at(-1.0)) / (2.0 * step);
+                let scale = exact.column(j).norm().max(1e-2);
+                prop_assert!((numeric - exact.column(j)).norm() < 1e-6 * scale, "{j} {numeric} {}", exact.column(j));
+            }
+        }
+
+        #[test]
+        fn sights_move_with_the_skew_as_central_differences_say(
+            x in -0.3..0.3_f64, v in -0.25..0.25_f64, rho in 0.0..0.5_f64,
+            twist in prop::array::uniform6(-1.0..1.0_f64),
+        ) {
+            let rig = rig();
+            let prev_from_now = se3::exp(&Vector6::new(0.1, 0.0, 0.2, 0.0, 0.05, 0.0));
+            let (y, twist) = (Vector3::new(x, v, rho), Vector6::from(twist));
+            let exact = sight_by_skew(&rig, &prev_from_now.inverse(), &y, &twist).expect("in front");
+            let h = 1e-5;
+            let at = |dt: f64| {
+                let later = prev_from_now * se3::exp(&(twist * dt));
+                let left = seen_at(&rig, &prev_from_now.inverse(), &y).expect("in front");
+                let right = seen_at(&rig, &later.inverse(), &y).expect("in front");
+                Vector4::new(left[0], left[1], right[2], right[3])
+            };
+            let numeric = (at(h) - at(-h)) / (2.0 * h);
+            prop_assert!((numeric - exact).norm() < 1e-6 * (1.0 + exact.norm()));
+        }
+    }
+}

@@ -1,0 +1,85 @@
+//! The window of keyframes as an estimator of tracked points: every pair is a keyframe.
+
+use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
+use crate::estimation::Settings;
+use crate::estimation::window::{Seen, Window};
+use crate::geometry::StereoRig;
+use nalgebra::{Isometry3, Matrix6};
+
+/// The estimator that the pipeline runs, on points instead of images.
+pub struct WindowOdometry {
+    window: Window,
+    pairs: u64,
+    predicted: Isometry3<f64>,
+    known: Vec<Seen>,
+    weights: Vec<f64>,
+    new: Vec<Seen>,
+}
+
+/// The first pair is the origin; its covariance only has to be positive definite.
+const ORIGIN_VARIANCE: f64 = 1e-16;
+
+impl WindowOdometry {
+    /// An odometry that begins with the next pair.
+    #[must_use]
+    pub fn new(rig: &StereoRig, settings: &Settings) -> Self {
+        Self {
+            window: Window::new(rig.clone(), settings.clone()),
+            pairs: 0,
+            predicted: Isometry3::identity(),
+            known: Vec::new(),
+            weights: Vec::new(),
+            new: Vec::new(),
+        }
+    }
+}
+
+impl FrameEstimator for WindowOdometry {
+    fn observe(&mut self, sights: &[TrackedSight]) -> Option<FrameEstimate> {
+        self.known.clear();
+        self.new.clear();
+        for s in sights {
+            let seen = Seen {
+                id: s.id,
+                measurement: s.measurement,
+            };
+            match self.window.landmark(s.id) {
+                Some(_) => self.known.push(seen),
+                None => self.new.push(seen),
+            }
+        }
+        self.pairs += 1;
+        if self.pairs == 1 {
+            let cov = Matrix6::identity() * ORIGIN_VARIANCE;
+            self.window.begin_at(&Isometry3::identity(), &cov);
+            self.window.promote(&self.new);
+            return Some(FrameEstimate {
+                prev_from_now: Isometry3::identity(),
+                cov_motion: cov,
+                odom_from_camera: Isometry3::identity(),
+                cov_pose: cov,
+            });
+        }
+        self.weights.clear();
+        self.weights.resize(self.known.len(), 1.0);
+        let consent =
+            self.window
+                .consent(&self.known, &self.weights, &self.predicted, self.pairs)?;
+        let agreed: Vec<Seen> = consent
+            .inliers
+            .iter()
+            .map(|&i| self.known[i as usize])
+            .collect();
+        self.window.add(&consent.newest_from_now, &agreed);
+        let tracked = self.window.adjust()?;
+        self.window.settle();
+        self.window.promote(&self.new);
+        self.predicted = tracked.motion.prev_from_now;
+        Some(FrameEstimate {
+            prev_from_now: tracked.motion.prev_from_now,
+            cov_motion: tracked.motion.cov_right,
+            odom_from_camera: tracked.odom_from_now,
+            cov_pose: tracked.cov_pose_right,
+        })
+    }
+}
