@@ -339,8 +339,8 @@ mod tests {
         );
         let one = tracks(&rig, &step(), 1, [2.0, 40.0], 0.0, &mut random(14))[0];
         let mut same = vec![one; 5];
+        // One point, however often, determines nothing.
         let found = adjuster.adjust(&rig, &Model::Se3, &step(), &mut same);
-        // One point, however often: rounding may leave a definite matrix, but no certainty.
-        assert!(found.is_none_or(|f| f.cov_right.trace() > 1e3));
+        assert!(found.is_none());
     }
 }

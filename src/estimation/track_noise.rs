@@ -125,12 +125,12 @@ impl TrackResidual {
 
 /// What the meter believes of persistence and reuse before it has seen anything is worth so many
 /// tracks; what it believes of the variance, one: a single pair tells that well.
-const PRIOR_TRACKS: f64 = 100.0;
+const PRIOR_TRACKS: f64 = 300.0;
 /// Of what was seen, so much counts one pair later: a memory of fifty pairs.
 const MEMORY: f64 = 0.98;
-/// Squared residuals beyond this many times the variance factor are outliers (five degrees of
-/// freedom: 0.1 %).
-const GATE: f64 = 20.0;
+/// Squared residuals beyond this many times the variance factor are blunders (five degrees of
+/// freedom). Tracks come here judged; a narrow gate on top would cut off the tails that are noise.
+const GATE: f64 = 100.0;
 
 /// Measures the noise of tracks.
 #[derive(Clone, Debug)]
@@ -151,7 +151,10 @@ impl TrackNoiseMeter {
         // s² as from one track's five squares; s² λ and s² κ relative to it, whatever it is.
         meter.add(5.0 * expected.variance_factor, &Vector3::new(5.0, 0.0, 0.0));
         let weight = (5.0 * PRIOR_TRACKS).sqrt();
-        meter.add(0.0, &(Vector3::new(-expected.persistence, 1.0, 0.0) * weight));
+        meter.add(
+            0.0,
+            &(Vector3::new(-expected.persistence, 1.0, 0.0) * weight),
+        );
         meter.add(0.0, &(Vector3::new(-expected.reuse, 0.0, 1.0) * weight));
         meter
     }
@@ -274,8 +277,7 @@ mod tests {
                 before.now.px = noisy(&p.now.px, n1);
                 let mut now = *p;
                 let Some(seen) = rig.project(
-                    &(step.inverse()
-                        * nalgebra::Point3::from(Vector3::new(y.x, y.y, 1.0) / y.z)),
+                    &(step.inverse() * nalgebra::Point3::from(Vector3::new(y.x, y.y, 1.0) / y.z)),
                 ) else {
                     continue;
                 };
@@ -313,16 +315,16 @@ mod tests {
                 reuse,
             };
             let found = measure(&truth, 41);
-            // 6000 tracks: σ of λ and κ is about 0.01, and the prior of 100 tracks pulls by 0.02.
+            // 6000 tracks: σ of λ and κ is about 0.01, and the prior of 300 tracks pulls by 0.05.
             assert!(
                 (found.variance_factor / variance_factor - 1.0).abs() < 0.05,
                 "{truth:?} {found:?}"
             );
             assert!(
-                (found.persistence - persistence).abs() < 0.06,
+                (found.persistence - persistence).abs() < 0.08,
                 "{truth:?} {found:?}"
             );
-            assert!((found.reuse - reuse).abs() < 0.06, "{truth:?} {found:?}");
+            assert!((found.reuse - reuse).abs() < 0.08, "{truth:?} {found:?}");
         }
     }
 
