@@ -46,7 +46,7 @@ impl TrackNoise {
     }
 
     /// What one track's noise contributes to the covariance of a motion; `influence` is
-    /// [`whitened`].
+    /// [whitened](Influence::whitened).
     #[must_use]
     pub fn covariance(&self, influence: &Influence) -> Matrix6<f64> {
         let (p, q) = (&influence.by_prev, &influence.by_now);
@@ -54,20 +54,6 @@ impl TrackNoise {
         let shared = product_transposed(p, q) * self.persistence;
         se3::symmetric(&((own + shared + shared.transpose()) * self.variance_factor))
     }
-}
-
-/// An influence by pixels in units of their σ.
-#[must_use]
-pub fn whitened(influence: &Influence, point: &TrackedPoint) -> Influence {
-    let mut scaled = *influence;
-    for i in 0..4 {
-        scaled
-            .by_prev
-            .column_mut(i)
-            .scale_mut(point.prev.sigma_px[i]);
-        scaled.by_now.column_mut(i).scale_mut(point.now.sigma_px[i]);
-    }
-    scaled
 }
 
 /// A track's residual in one motion, in σ, and the projection that made it of the noise.

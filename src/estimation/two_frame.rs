@@ -284,7 +284,18 @@ mod tests {
                 [5, 17, 40].iter().all(|i| !found.tracks.contains(i)),
                 "{estimator:?}"
             );
-            assert!(found.tracks.len() > 50 && found.tracks.len() == found.influences.len());
+            // Distant points have no certain depth, and only the adjustment can use them.
+            let least = if estimator == Estimator::Bundle {
+                54
+            } else {
+                20
+            };
+            assert!(
+                found.tracks.len() >= least,
+                "{estimator:?} {}",
+                found.tracks.len()
+            );
+            assert_eq!(found.tracks.len(), found.influences.len());
             assert!(
                 (0.6..1.5).contains(&found.variance_factor),
                 "{}",

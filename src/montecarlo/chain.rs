@@ -4,7 +4,7 @@ use super::Correlation;
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::motion_chain::{ChainedTrack, MotionChain};
-use crate::estimation::track_noise::{self, TrackNoise, TrackNoiseMeter, TrackResidual};
+use crate::estimation::track_noise::{TrackNoise, TrackNoiseMeter, TrackResidual};
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
 use crate::estimation::{Model, calibration, inverse_depth};
 use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
@@ -128,7 +128,7 @@ impl<'a> TwoFrameChain<'a> {
         tracks
             .map(|(&i, influence)| ChainedTrack {
                 id: self.ids[i as usize],
-                influence: track_noise::whitened(influence, &self.points[i as usize]),
+                influence: influence.whitened(&self.points[i as usize]),
             })
             .collect()
     }
