@@ -93,6 +93,9 @@ pub(crate) struct Args {
     /// Draw an error of the rig in each run from the uncertainty that its file states.
     #[arg(long, value_enum, default_value_t = Settings::default().rig_error)]
     rig_error: RigError,
+    /// Largest squared residual of a track that counts, σ².
+    #[arg(long, value_name = "SIGMA2", default_value_t = Settings::default().gate_sigma2)]
+    gate: f64,
     /// What is assumed of consecutive motions, which share pixels.
     #[arg(long, value_enum, default_value_t = Settings::default().correlation)]
     correlation: Correlation,
@@ -217,8 +220,8 @@ impl Args {
             persistence: self.persistence,
             stated_sigma_px: self.stated_sigma_px,
             rig_error: self.rig_error,
+            gate_sigma2: self.gate,
             correlation: self.correlation,
-            ..Settings::default()
         };
         settings
             .check()

@@ -194,7 +194,8 @@ fn noise_that_is_not_as_stated_is_told_by_the_residuals() {
         let settings = Settings {
             noise,
             stated_sigma_px: Some(0.5),
-            runs: 500,
+            runs: 1000,
+            seed: 5,
             ..settings()
         };
         let outcome = run_motion(&thesis_rig(), &settings, &silent).expect("determined");
