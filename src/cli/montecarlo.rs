@@ -188,6 +188,17 @@ fn run_stages(
     Ok(outcomes)
 }
 
+/// The flag that sets a setting.
+fn flag_of(key: &str) -> String {
+    match key {
+        "noise.sigma_px" | "noise.scale_px" => "sigma-px".to_owned(),
+        "noise.degrees_of_freedom" => "freedom".to_owned(),
+        "noise.share" => "outliers".to_owned(),
+        "noise.outlier_sigma_px" => "outlier-sigma-px".to_owned(),
+        other => other.replace(' ', "-"),
+    }
+}
+
 fn unwritable(path: &std::path::Path, cause: &std::io::Error) -> Failure {
     Failure::other(format!("{}: cannot be written: {cause}", path.display()))
 }
@@ -225,7 +236,7 @@ impl Args {
         };
         settings
             .check()
-            .map_err(|e| Failure::usage(format!("--{}: {}", e.key.replace(' ', "-"), e.cause)))?;
+            .map_err(|e| Failure::usage(format!("--{}: {}", flag_of(e.key), e.cause)))?;
         Ok(settings)
     }
 

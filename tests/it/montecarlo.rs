@@ -110,12 +110,12 @@ fn mistakes_are_told_in_a_sentence() {
         (
             &["--noise", "student", "--freedom", "1"],
             2,
-            "noise.degrees_of_freedom",
+            "--freedom: must be from 2.01 to 1000000, but is 1",
         ),
         (
-            &["--features", "3", "--sigma-px", "400"],
+            &["--json", "-o", "/dev/null/nowhere"],
             1,
-            "gave an estimate: there is nothing to compare",
+            "/dev/null/nowhere: cannot be written",
         ),
     ] {
         let output = small(args);
