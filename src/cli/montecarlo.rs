@@ -93,6 +93,9 @@ pub(crate) struct Args {
     /// Draw an error of the rig in each run from the uncertainty that its file states.
     #[arg(long, value_enum, default_value_t = Settings::default().rig_error)]
     rig_error: RigError,
+    /// Largest squared residual of a track that counts, σ².
+    #[arg(long, value_name = "SIGMA2", default_value_t = Settings::default().gate_sigma2)]
+    gate: f64,
     /// What is assumed of consecutive motions, which share pixels.
     #[arg(long, value_enum, default_value_t = Settings::default().correlation)]
     correlation: Correlation,
@@ -185,6 +188,17 @@ fn run_stages(
     Ok(outcomes)
 }
 
+/// The flag that sets a setting.
+fn flag_of(key: &str) -> String {
+    match key {
+        "noise.sigma_px" | "noise.scale_px" => "sigma-px".to_owned(),
+        "noise.degrees_of_freedom" => "freedom".to_owned(),
+        "noise.share" => "outliers".to_owned(),
+        "noise.outlier_sigma_px" => "outlier-sigma-px".to_owned(),
+        other => other.replace(' ', "-"),
+    }
+}
+
 fn unwritable(path: &std::path::Path, cause: &std::io::Error) -> Failure {
     Failure::other(format!("{}: cannot be written: {cause}", path.display()))
 }
@@ -241,12 +255,12 @@ impl Args {
             persistence: self.persistence,
             stated_sigma_px: self.stated_sigma_px,
             rig_error: self.rig_error,
+            gate_sigma2: self.gate,
             correlation: self.correlation,
-            ..Settings::default()
         };
         settings
             .check()
-            .map_err(|e| Failure::usage(format!("--{}: {}", e.key.replace(' ', "-"), e.cause)))?;
+            .map_err(|e| Failure::usage(format!("--{}: {}", flag_of(e.key), e.cause)))?;
         Ok(settings)
     }
 

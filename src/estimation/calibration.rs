@@ -123,18 +123,105 @@ pub fn of_motion<'a>(
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::estimation::seen_at;
+    use crate::estimation::two_frame::{Estimator, TwoFrame};
+    use crate::estimation::{Model, seen_at, synthetic};
     use crate::geometry::rig_parameters::RigVector;
     use crate::geometry::{parse_rig, se3};
     use proptest::prelude::*;
 
-    pub(crate) fn rig() -> StereoRig {
+    fn rig() -> StereoRig {
         parse_rig(
             "left = { width = 640, height = 480, focal = [885.8, 884.1], principal_point = [313.2, 243.5], distortion = { model = \"radtan\", coefficients = [-0.25, 0.1, 0.0005, -0.0003, 0.01, 0.02, 0.03, 0.01] } }
              right = { width = 640, height = 480, focal = [882.9, 881.2], principal_point = [300.2, 246.4], distortion = { model = \"equidistant\", coefficients = [-0.01, 0.02, -0.01, 0.002] } }
              right_from_left = { translation_m = [-0.3857, -0.0072, 0.0001], rotation_vector_rad = [0.04046, 0.01616, 0.01419] }",
         )
         .expect("valid")
+    }
+
+    /// Exact sights of some points by another rig than the estimator knows, the right images exposed
+    /// `skew_s` late.
+    fn seen_by(
+        truth: &StereoRig,
+        prev_from_now: &Isometry3<f64>,
+        points: &[TrackedPoint],
+        skew_s: f64,
+    ) -> Vec<TrackedPoint> {
+        let late = se3::exp(&(twist() * skew_s));
+        let sight = |prev_from_camera: &Isometry3<f64>, y: &Vector3<f64>| {
+            let left = seen_at(truth, &prev_from_camera.inverse(), y).expect("in front");
+            let right = seen_at(truth, &(prev_from_camera * late).inverse(), y).expect("in front");
+            Vector4::new(left[0], left[1], right[2], right[3])
+        };
+        let mut seen = points.to_vec();
+        for p in &mut seen {
+            p.prev.px = sight(&Isometry3::identity(), &p.inverse_depth);
+            p.now.px = sight(prev_from_now, &p.inverse_depth);
+        }
+        seen
+    }
+
+    fn twist() -> Vector6<f64> {
+        Vector6::new(0.3, -0.1, 3.0, 0.1, 0.4, -0.05)
+    }
+
+    #[test]
+    fn motions_move_with_the_rig_and_the_skew_as_central_differences_say() {
+        let rig = synthetic::rig();
+        let step = synthetic::step();
+        let points = synthetic::tracks(
+            &rig,
+            &step,
+            25,
+            [2.0, 10.0],
+            0.0,
+            &mut synthetic::random(61),
+        );
+        for estimator in [Estimator::Bundle, Estimator::Svd, Estimator::Weighted] {
+            let mut two_frame = TwoFrame::new(estimator, Model::Se3, 1e9);
+            let mut solve = |points: &[TrackedPoint]| {
+                two_frame.estimate(&rig, &step, points).expect("determined")
+            };
+            let base = solve(&seen_by(&rig, &step, &points, 0.0));
+            assert_eq!(base.tracks.len(), points.len());
+            let exact = of_motion(
+                &rig,
+                &step,
+                points.iter().zip(&base.influences),
+                &twist(),
+                &twist(),
+            )
+            .expect("in front");
+            let log =
+                |found: &Isometry3<f64>| se3::log(&(base.estimate.prev_from_now.inverse() * found));
+            let mut check =
+                |what: String, by: Vector6<f64>, h: f64, at: &dyn Fn(f64) -> Vec<TrackedPoint>| {
+                    let plus = log(&solve(&at(h)).estimate.prev_from_now);
+                    let minus = log(&solve(&at(-h)).estimate.prev_from_now);
+                    let numeric = (plus - minus) / (2.0 * h);
+                    let gap = (numeric - by).norm();
+                    assert!(
+                        gap < 1e-5 * (by.norm() + 1e-4 / h * 1e-3),
+                        "{estimator:?} {what}: {numeric} {by}"
+                    );
+                };
+            for (name, j) in rig.parameter_names() {
+                let h = if j < EXTRINSICS && j % CAMERA_PARAMETERS < 4 {
+                    1e-2
+                } else {
+                    1e-5
+                };
+                let by = exact.by_rig.by_parameters().column(j).into_owned();
+                check(name, by, h, &|error: f64| {
+                    let mut c = RigVector::zeros();
+                    c[j] = error;
+                    seen_by(&rig.with_error(&c), &step, &points, 0.0)
+                });
+            }
+            let by = exact.by_skew.by_parameters().column(0).into_owned();
+            check("skew".to_owned(), by, 1e-5, &|skew| {
+                seen_by(&rig, &step, &points, skew)
+            });
+        }
     }
 
     proptest! {

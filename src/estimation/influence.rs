@@ -21,21 +21,33 @@ pub struct Influence {
     pub by_prev: Matrix6x4<f64>,
     /// With those of this pair: `Q`.
     pub by_now: Matrix6x4<f64>,
+    /// The robust weight that each coordinate of the earlier pair had, 1 for all but outliers: one
+    /// of weight w counts as a measurement of variance σ² / w.
+    pub weight_prev: Vector4<f64>,
+    /// That of this pair.
+    pub weight_now: Vector4<f64>,
 }
 
 impl Influence {
+    /// The same by pixels in units of their σ.
+    #[must_use]
+    pub fn whitened(&self, point: &TrackedPoint) -> Self {
+        let mut scaled = *self;
+        for i in 0..4 {
+            let prev = point.prev.sigma_px[i] / self.weight_prev[i].sqrt();
+            let now = point.now.sigma_px[i] / self.weight_now[i].sqrt();
+            scaled.by_prev.column_mut(i).scale_mut(prev);
+            scaled.by_now.column_mut(i).scale_mut(now);
+        }
+        scaled
+    }
+
     /// What the noise of one track contributes to the motion's covariance, the two pairs' being
     /// independent.
     #[must_use]
     pub fn covariance(&self, point: &TrackedPoint) -> Matrix6<f64> {
-        let of = |by: &Matrix6x4<f64>, sigma_px: &Vector4<f64>| {
-            let mut scaled = *by;
-            for (mut column, sigma) in scaled.column_iter_mut().zip(sigma_px) {
-                column *= *sigma;
-            }
-            product_transposed(&scaled, &scaled)
-        };
-        of(&self.by_prev, &point.prev.sigma_px) + of(&self.by_now, &point.now.sigma_px)
+        let by = self.whitened(point);
+        product_transposed(&by.by_prev, &by.by_prev) + product_transposed(&by.by_now, &by.by_now)
     }
 }
 
@@ -101,6 +113,8 @@ pub fn of_closed_form(
         Influence {
             by_prev: -inverse * by_prev * t.prev_by_px,
             by_now: -inverse * by_now * t.now_by_px,
+            weight_prev: Vector4::repeat(1.0),
+            weight_now: Vector4::repeat(1.0),
         }
     }));
     Some(())
@@ -125,6 +139,8 @@ pub fn of_weighted(
             .map(|(t, (by_prev, by_now))| Influence {
                 by_prev: by_prev * t.prev_by_px,
                 by_now: by_now * t.now_by_px,
+                weight_prev: Vector4::repeat(1.0),
+                weight_now: Vector4::repeat(1.0),
             }),
     );
     Some(())

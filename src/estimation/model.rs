@@ -152,18 +152,19 @@ impl Model {
     /// The inverse of an information matrix (or Hessian) within the model: `B (Bᵀ H B)⁻¹ Bᵀ`, and
     /// so both the covariance of the estimate and what turns a gradient into a step.
     ///
-    /// `None` where `H` is not positive definite within the model.
+    /// `None` where `H` is not positive definite within the model, or so nearly singular that its
+    /// inverse would be rounding rather than information.
     #[must_use]
     pub fn inverse(&self, info: &Matrix6<f64>) -> Option<Matrix6<f64>> {
-        let inverse = match self {
-            Self::Se3 => info.cholesky()?.inverse(),
+        match self {
+            Self::Se3 => inverse_definite(info),
             Self::Planar(plane) => {
                 let basis = plane.basis();
-                let reduced = basis.transpose() * info * basis;
-                basis * reduced.cholesky()?.inverse() * basis.transpose()
+                let reduced: Matrix3<f64> = basis.transpose() * info * basis;
+                let inverse = basis * inverse_definite(&reduced)? * basis.transpose();
+                Some(se3::symmetric(&inverse))
             }
-        };
-        Some(se3::symmetric(&inverse))
+        }
     }
 
     /// The possible motion nearest to `a_from_b`.
@@ -191,6 +192,31 @@ impl Model {
             }
         }
     }
+}
+
+/// The share of a diagonal element that elimination must leave of it: metres and radians are scaled
+/// alike first, so that this is a matter of geometry.
+const SMALLEST_PIVOT: f64 = 1e-11;
+
+fn inverse_definite<const D: usize>(m: &SMatrix<f64, D, D>) -> Option<SMatrix<f64, D, D>> {
+    let scale = m
+        .diagonal()
+        .map(|d| if d > 0.0 { 1.0 / d.sqrt() } else { f64::NAN });
+    let mut scaled = *m;
+    for (i, j) in (0..D).flat_map(|i| (0..D).map(move |j| (i, j))) {
+        scaled[(i, j)] = 0.5 * (m[(i, j)] + m[(j, i)]) * scale[i] * scale[j];
+    }
+    let factor = scaled.cholesky()?;
+    let lower = factor.l_dirty();
+    if (0..D).any(|i| lower[(i, i)] * lower[(i, i)] < SMALLEST_PIVOT) {
+        return None;
+    }
+    let inverse = factor.inverse();
+    let mut out = inverse;
+    for (i, j) in (0..D).flat_map(|i| (0..D).map(move |j| (i, j))) {
+        out[(i, j)] = 0.5 * (inverse[(i, j)] + inverse[(j, i)]) * scale[i] * scale[j];
+    }
+    out.iter().all(|v| v.is_finite()).then_some(out)
 }
 
 #[cfg(test)]

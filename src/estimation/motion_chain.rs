@@ -18,7 +18,7 @@ use nalgebra::{Isometry3, Matrix6, Matrix6x4};
 pub struct ChainedTrack {
     /// The same in every motion that uses the track.
     pub id: u64,
-    /// [`whitened`](super::track_noise::whitened).
+    /// [Whitened](Influence::whitened).
     pub influence: Influence,
 }
 
@@ -48,7 +48,9 @@ impl MotionChain {
         let mut before = self.last.iter().peekable();
         let mut alive = self.living.iter().peekable();
         for track in tracks {
-            let Influence { by_prev, by_now } = &track.influence;
+            let Influence {
+                by_prev, by_now, ..
+            } = &track.influence;
             own += product_transposed(by_prev, by_prev) + product_transposed(by_now, by_now);
             while before.next_if(|other| other.id < track.id).is_some() {}
             if let Some(other) = before.next_if(|other| other.id == track.id) {

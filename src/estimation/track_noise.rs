@@ -46,7 +46,7 @@ impl TrackNoise {
     }
 
     /// What one track's noise contributes to the covariance of a motion; `influence` is
-    /// [`whitened`].
+    /// [whitened](Influence::whitened).
     #[must_use]
     pub fn covariance(&self, influence: &Influence) -> Matrix6<f64> {
         let (p, q) = (&influence.by_prev, &influence.by_now);
@@ -54,20 +54,6 @@ impl TrackNoise {
         let shared = product_transposed(p, q) * self.persistence;
         se3::symmetric(&((own + shared + shared.transpose()) * self.variance_factor))
     }
-}
-
-/// An influence by pixels in units of their σ.
-#[must_use]
-pub fn whitened(influence: &Influence, point: &TrackedPoint) -> Influence {
-    let mut scaled = *influence;
-    for i in 0..4 {
-        scaled
-            .by_prev
-            .column_mut(i)
-            .scale_mut(point.prev.sigma_px[i]);
-        scaled.by_now.column_mut(i).scale_mut(point.now.sigma_px[i]);
-    }
-    scaled
 }
 
 /// A track's residual in one motion, in σ, and the projection that made it of the noise.
@@ -125,12 +111,12 @@ impl TrackResidual {
 
 /// What the meter believes of persistence and reuse before it has seen anything is worth so many
 /// tracks; what it believes of the variance, one: a single pair tells that well.
-const PRIOR_TRACKS: f64 = 100.0;
+const PRIOR_TRACKS: f64 = 300.0;
 /// Of what was seen, so much counts one pair later: a memory of fifty pairs.
 const MEMORY: f64 = 0.98;
-/// Squared residuals beyond this many times the variance factor are outliers (five degrees of
-/// freedom: 0.1 %).
-const GATE: f64 = 20.0;
+/// Squared residuals beyond this many times the variance factor are blunders (five degrees of
+/// freedom). Tracks come here judged; a narrow gate on top would cut off the tails that are noise.
+const GATE: f64 = 100.0;
 
 /// Measures the noise of tracks.
 #[derive(Clone, Debug)]
@@ -315,16 +301,16 @@ mod tests {
                 reuse,
             };
             let found = measure(&truth, 41);
-            // 6000 tracks: σ of λ and κ is about 0.01, and the prior of 100 tracks pulls by 0.02.
+            // 6000 tracks: σ of λ and κ is about 0.01, and the prior of 300 tracks pulls by 0.05.
             assert!(
                 (found.variance_factor / variance_factor - 1.0).abs() < 0.05,
                 "{truth:?} {found:?}"
             );
             assert!(
-                (found.persistence - persistence).abs() < 0.06,
+                (found.persistence - persistence).abs() < 0.08,
                 "{truth:?} {found:?}"
             );
-            assert!((found.reuse - reuse).abs() < 0.06, "{truth:?} {found:?}");
+            assert!((found.reuse - reuse).abs() < 0.08, "{truth:?} {found:?}");
         }
     }
 

@@ -179,3 +179,128 @@ fn retain_by<T>(items: &mut Vec<T>, keep: impl Fn(usize) -> bool) {
         keep(place - 1)
     });
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::estimation::synthetic::{random, rig, step, tracks};
+    use crate::estimation::{MotionModel, inverse_depth};
+    use nalgebra::{Point3, Vector2, Vector4, Vector6};
+    use rand::RngExt;
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    /// Tracks of points that need not determine a motion: all far, on a line, on a plane, in one
+    /// spot, or anywhere.
+    fn any_tracks(kind: usize, rng: &mut Xoshiro256PlusPlus) -> Vec<TrackedPoint> {
+        let rig = rig();
+        let count = rng.random_range(3..12);
+        let (u, v) = (rng.random_range(80.0..560.0), rng.random_range(60.0..420.0));
+        let mut found = Vec::new();
+        for i in 0..40 {
+            if found.len() == count {
+                break;
+            }
+            let at = f64::from(i) / 40.0;
+            let (px, z) = match kind {
+                0 => (
+                    Vector2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0)),
+                    rng.random_range(500.0..5000.0),
+                ),
+                1 => (Vector2::new(u, v), 2.0 + 30.0 * at),
+                2 => (
+                    Vector2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0)),
+                    8.0,
+                ),
+                3 => (Vector2::new(u + at, v - at), 5.0 + 1e-3 * at),
+                _ => (
+                    Vector2::new(rng.random_range(0.0..640.0), rng.random_range(0.0..480.0)),
+                    rng.random_range(1.0..60.0),
+                ),
+            };
+            let prev = Point3::from(rig.left.ray(&px).expect("inside") * z);
+            let mut measure = |p: &Point3<f64>| {
+                let noise = Vector4::from_fn(|_, _| rng.random_range(-0.8..0.8));
+                Some(crate::estimation::StereoMeasurement {
+                    px: rig.project(p)? + noise,
+                    sigma_px: Vector4::repeat(0.5),
+                })
+            };
+            let (Some(prev), Some(now)) = (measure(&prev), measure(&(step().inverse() * prev)))
+            else {
+                continue;
+            };
+            if let Some(inverse_depth) = inverse_depth(&rig, &prev) {
+                found.push(TrackedPoint {
+                    prev,
+                    now,
+                    inverse_depth,
+                });
+            }
+        }
+        found
+    }
+
+    #[test]
+    fn every_covariance_is_one_under_ten_thousand_configurations() {
+        let rig = rig();
+        let mut rng = random(51);
+        let (mut given, mut refused) = (0, 0);
+        for i in 0..10_000 {
+            let estimator = [Estimator::Bundle, Estimator::Svd, Estimator::Weighted][i % 3];
+            let model = [MotionModel::Se3, MotionModel::Planar][(i / 3) % 2].of(&rig);
+            let points = any_tracks((i / 6) % 5, &mut rng);
+            match TwoFrame::new(estimator, model, 1e6).estimate(&rig, &step(), &points) {
+                Some(found) => {
+                    given += 1;
+                    let nees = model.nees(&Vector6::repeat(1e-3), &found.estimate.cov_right);
+                    assert!(
+                        nees.is_some(),
+                        "{i} {estimator:?} {}",
+                        found.estimate.cov_right
+                    );
+                }
+                None => refused += 1,
+            }
+        }
+        assert!(
+            given > 2000 && refused > 500,
+            "{given} given, {refused} refused"
+        );
+    }
+
+    #[test]
+    fn outliers_do_not_count() {
+        let rig = rig();
+        let mut points = tracks(&rig, &step(), 60, [2.0, 40.0], 0.5, &mut random(52));
+        for i in [5, 17, 40] {
+            points[i].now.px[0] += 30.0;
+            points[i].now.px[2] += 30.0;
+        }
+        for estimator in [Estimator::Bundle, Estimator::Svd, Estimator::Weighted] {
+            let found = TwoFrame::new(estimator, Model::Se3, 20.0)
+                .estimate(&rig, &step(), &points)
+                .expect("determined");
+            assert!(
+                [5, 17, 40].iter().all(|i| !found.tracks.contains(i)),
+                "{estimator:?}"
+            );
+            // Distant points have no certain depth, and only the adjustment can use them.
+            let least = if estimator == Estimator::Bundle {
+                54
+            } else {
+                20
+            };
+            assert!(
+                found.tracks.len() >= least,
+                "{estimator:?} {}",
+                found.tracks.len()
+            );
+            assert_eq!(found.tracks.len(), found.influences.len());
+            assert!(
+                (0.6..1.5).contains(&found.variance_factor),
+                "{}",
+                found.variance_factor
+            );
+        }
+    }
+}

@@ -394,6 +394,38 @@ translation_m = 2e-4
     }
 
     #[test]
+    fn the_covariance_of_a_calibration_comes_from_its_file_beside_the_rig() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (head, _) = GOOD.split_once("[uncertainty]").expect("stated");
+        let rig_file = folder.path().join("rig.toml");
+        let text = format!("{head}[uncertainty]\ncovariance = \"rig.cov.csv\"\n");
+        std::fs::write(&rig_file, &text).expect("written");
+        let missing = load_rig(&rig_file).expect_err("no such file").to_string();
+        assert!(
+            missing.contains(": uncertainty.covariance: ")
+                && missing.contains("rig.cov.csv: cannot be read"),
+            "{missing}"
+        );
+        std::fs::write(
+            folder.path().join("rig.cov.csv"),
+            "tx,ry\n4e-8,1e-8\n1e-8,1e-8\n",
+        )
+        .expect("written");
+        let rig = load_rig(&rig_file).expect("valid");
+        let covariance = rig.covariance().expect("stated");
+        assert_eq!(covariance[(24, 24)], 4e-8);
+        assert_eq!((covariance[(24, 28)], covariance[(28, 28)]), (1e-8, 1e-8));
+        assert_eq!(covariance.trace(), 5e-8);
+        assert!(rig_to_toml(&rig).contains("covariance = \"rig.cov.csv\""));
+        let both =
+            parse_rig(&text.replace("covariance", "focal_px = 1.0\ncovariance")).expect_err("two");
+        assert!(
+            both.to_string().contains("only one of the two may"),
+            "{both}"
+        );
+    }
+
+    #[test]
     fn mistakes_are_named_with_line_and_key() {
         assert_eq!(
             error_of("focal = [885.8,", "focal = [nan,"),

@@ -4,7 +4,7 @@ use super::Correlation;
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::motion_chain::{ChainedTrack, MotionChain};
-use crate::estimation::track_noise::{self, TrackNoise, TrackNoiseMeter, TrackResidual};
+use crate::estimation::track_noise::{TrackNoise, TrackNoiseMeter, TrackResidual};
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
 use crate::estimation::{Model, calibration, inverse_depth};
 use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
@@ -18,6 +18,7 @@ pub struct TwoFrameChain<'a> {
     rig: &'a StereoRig,
     two_frame: TwoFrame,
     correlation: Correlation,
+    motion_freedom: f64,
     meter: TrackNoiseMeter,
     considered: Option<Box<RigCovariance>>,
     before: Vec<(TrackedSight, Option<Vector3<f64>>)>,
@@ -50,6 +51,7 @@ impl<'a> TwoFrameChain<'a> {
             rig,
             two_frame: TwoFrame::new(estimator, model, gate_sigma2),
             correlation,
+            motion_freedom: model.degrees_of_freedom() as f64,
             meter: TrackNoiseMeter::new(&TrackNoise::of_detector(1.0)),
             considered: None,
             before: Vec::new(),
@@ -118,8 +120,13 @@ impl<'a> TwoFrameChain<'a> {
             self.meter
                 .observe(before.map(|(_, before)| before), residual);
         }
+        // The motion, too, was fitted to the residuals.
+        let count = 5.0 * residuals.len().max(2) as f64;
+        let fitted = count / (count - self.motion_freedom);
         self.residuals = residuals;
-        self.meter.noise()
+        let mut noise = self.meter.noise();
+        noise.variance_factor *= fitted;
+        noise
     }
 
     /// The tracks of a motion for the chain.
@@ -128,7 +135,7 @@ impl<'a> TwoFrameChain<'a> {
         tracks
             .map(|(&i, influence)| ChainedTrack {
                 id: self.ids[i as usize],
-                influence: track_noise::whitened(influence, &self.points[i as usize]),
+                influence: influence.whitened(&self.points[i as usize]),
             })
             .collect()
     }

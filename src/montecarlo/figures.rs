@@ -158,8 +158,8 @@ fn point_errors(outcome: &TriangulationOutcome) -> Drawing {
             frame,
             &sample,
             &covs,
-            |largest| length_unit(largest),
-            |largest| length_unit(largest),
+            length_unit,
+            length_unit,
             [&format!("right, at {:.0} m", p.point.z), "ahead"],
         );
     }
