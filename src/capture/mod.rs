@@ -3,6 +3,8 @@
 //! A [`PairSource`] hands out one [`PairEvent`] after the other until its recording ends. What goes
 //! wrong with one pair is an event, not the end of the run.
 
+pub mod camera;
+pub mod clock;
 pub mod dataset;
 pub mod decode;
 mod decode_error;
@@ -12,6 +14,7 @@ mod jpeg;
 mod kitti;
 mod own;
 pub mod pace;
+pub mod pairing;
 pub mod read_ahead;
 mod text;
 mod yaml;
