@@ -18,33 +18,23 @@ pub struct Frame {
     /// The camera's own count of its frames, those that were lost included; where it begins is
     /// arbitrary. Does not wrap.
     pub number: u64,
-    /// When the camera says that it was taken.
-    pub stamp: Stamp,
+    /// When it was taken, by the source's [`clock`](FrameSource::clock), ns.
+    pub stamp_ns: i64,
     /// When the first of it arrived, CLOCK_MONOTONIC, ns.
     pub arrived_ns: i64,
     /// The image, raw.
     pub image: GrayImage,
 }
 
-/// A time, and whose clock tells it. Nanoseconds.
+/// Whose clock stamps a camera's frames.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub enum Stamp {
-    /// The camera's own clock: counts from anywhere, drifts, may wrap.
-    Camera(i64),
-    /// A clock that both cameras share, such as PTP's or a recording's.
-    Shared(i64),
+pub enum Clock {
+    /// The camera's own: counts from anywhere, drifts, may wrap.
+    Own,
+    /// One that both cameras share, such as PTP's or a recording's.
+    Shared,
     /// This host's CLOCK_MONOTONIC.
-    Host(i64),
-}
-
-impl Stamp {
-    /// The bare number.
-    #[must_use]
-    pub fn ns(self) -> i64 {
-        match self {
-            Self::Camera(ns) | Self::Shared(ns) | Self::Host(ns) => ns,
-        }
-    }
+    Host,
 }
 
 /// Why a frame that the camera took is not there.
@@ -181,8 +171,11 @@ pub trait FrameSource: Send {
     /// Width and height of its images, px.
     fn size_px(&self) -> (u32, u32);
 
-    /// What it is, for people: driver, model, serial number, format.
-    fn describe(&self) -> String;
+    /// Which camera it is: what tells it from any other of its kind.
+    fn identity(&self) -> String;
+
+    /// Whose clock stamps its frames.
+    fn clock(&self) -> Clock;
 
     /// Begins to take frames. Does nothing if it does so already.
     ///

@@ -372,6 +372,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                     used: Some(StereoPair {
                         sequence: stamp.sequence,
                         timestamp_ns: stamp.timestamp_ns,
+                        skew: crate::capture::Skew::default(),
                         left: left.job.image,
                         right: right.job.image,
                     }),
