@@ -13,7 +13,7 @@
 use super::camera::{CameraError, Clock, Frame, Loss, Losses, monotonic_ns, realtime_ns};
 use super::clock::{ClockEvent, ClockMap};
 use super::pairing::{Candidate, PairBy, Paired, Pairer, Skew, WhyUnmatched};
-use super::settings::{Settings, Stamps};
+use super::settings::{Clocks, Settings, Stamps};
 use super::supervisor::{Opener, Supervisor, open_patiently};
 use super::{PairEvent, PairSource, Side, StereoPair, Unusable};
 use crate::image::GrayImage;
@@ -331,6 +331,8 @@ struct Inner {
     stamps: Stamps,
     pair_by: PairBy,
     sigma_transit_ns: f64,
+    /// The settings say that the clocks are.
+    are_kept_together: bool,
     source_clocks: [Clock; 2],
     clocks: [ClockMap; 2],
     pairer: Pairer<Waiting>,
@@ -373,6 +375,7 @@ impl Shared {
             stamps: settings.stamps,
             pair_by: settings.pair_by,
             sigma_transit_ns: settings.sigma_transit_s * 1e9,
+            are_kept_together: settings.clocks == Clocks::Shared,
             source_clocks,
             clocks: Default::default(),
             pairer: Pairer::new(settings.pair_by, settings.tolerance_ns()),
@@ -530,7 +533,7 @@ impl Inner {
     }
 
     fn has_shared_clock(&self) -> bool {
-        self.source_clocks == [Clock::Shared; 2]
+        self.are_kept_together || self.source_clocks == [Clock::Shared; 2]
     }
 
     /// When a frame was taken by CLOCK_MONOTONIC, with its 1 σ.

@@ -16,6 +16,9 @@ pub struct Settings {
     /// How far apart in time the images of a pair may be taken, beyond three σ of their stamps. s, 0 to
     /// 0.1, default 0.005: a robot at 1 m/s moves 5 mm.
     pub tolerance_s: f64,
+    /// Whether the cameras' clocks run apart, `own`, or are kept together by PTP or the like, `shared`.
+    /// Default `own`: stamps are compared in this computer's clock, which costs some precision.
+    pub clocks: Clocks,
     /// Whose clock stamps the results: `host`, this computer's; `camera`, the left camera's, for
     /// cameras whose clock means something, such as PTP's. Default `host`.
     pub stamps: Stamps,
@@ -36,6 +39,17 @@ pub struct Settings {
     pub queue: usize,
 }
 
+/// Whether the cameras' clocks run apart.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Clocks {
+    /// Each has its own, unless the driver knows better.
+    #[default]
+    Own,
+    /// They are kept together, by PTP or the like.
+    Shared,
+}
+
 /// Whose clock stamps the results.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Deserialize, Serialize)]
 #[serde(rename_all = "lowercase")]
@@ -52,6 +66,7 @@ impl Default for Settings {
         Self {
             pair_by: PairBy::Stamp,
             tolerance_s: 0.005,
+            clocks: Clocks::Own,
             stamps: Stamps::Host,
             sigma_transit_s: 0.0001,
             stall_s: 2.0,

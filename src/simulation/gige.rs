@@ -224,31 +224,38 @@ impl Filler {
     /// Which number of the recording is due now. Blocks once, until the other camera runs too.
     fn due(&self) -> i64 {
         let tick = now_us() / self.period_us;
-        let mut start = self
-            .together
+        let first = self.first_tick(tick);
+        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
+        let due = match *last {
+            // Aravis sends all but the first frame at a tick.
+            None => {
+                let wait_us = first * self.period_us - now_us();
+                std::thread::sleep(Duration::from_micros(u64::try_from(wait_us).unwrap_or(0)));
+                (now_us() / self.period_us - first).max(0)
+            }
+            Some(last) => (tick - first).max(last + 1),
+        };
+        *last = Some(due);
+        due
+    }
+
+    /// The tick at which the recording began, or begins now that both cameras run.
+    fn first_tick(&self, tick: i64) -> i64 {
+        let together = &self.together;
+        let mut start = together
             .state
             .lock()
             .unwrap_or_else(PoisonError::into_inner);
         start.is_running[self.side as usize] = true;
         if start.first_tick.is_none() && start.is_running == [true; 2] {
-            start.first_tick = Some(tick);
-            self.together.changed.notify_all();
+            start.first_tick = Some(tick + 1);
+            together.changed.notify_all();
         }
-        let (mut start, _) = self
-            .together
+        let (mut start, _) = together
             .changed
             .wait_timeout_while(start, PATIENCE, |start| start.first_tick.is_none())
             .unwrap_or_else(PoisonError::into_inner);
-        let first = *start.first_tick.get_or_insert(tick);
-        drop(start);
-        let mut last = self.last.lock().unwrap_or_else(PoisonError::into_inner);
-        // The first frames leave when both cameras run, all others at their ticks.
-        let due = match *last {
-            None => (tick - first).max(0),
-            Some(last) => (tick - first).max(last + 1),
-        };
-        *last = Some(due);
-        due
+        *start.first_tick.get_or_insert(tick + 1)
     }
 
     /// The stamp of number `due` of a recording that is repeated, by the camera's clock, ns.
