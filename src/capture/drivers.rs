@@ -57,7 +57,7 @@ fn aravis(settings: CameraSettings, _: (u32, u32)) -> Result<Opener, CameraError
     Err(not_built(settings.driver, "aravis"))
 }
 
-#[cfg(any())]
+#[cfg(feature = "v4l")]
 fn v4l2(settings: CameraSettings, size_px: (u32, u32)) -> Result<Opener, CameraError> {
     use super::v4l2::V4l2Camera;
     Ok(Arc::new(move || {
@@ -65,12 +65,12 @@ fn v4l2(settings: CameraSettings, size_px: (u32, u32)) -> Result<Opener, CameraE
     }))
 }
 
-#[cfg(all())]
+#[cfg(not(feature = "v4l"))]
 fn v4l2(settings: CameraSettings, _: (u32, u32)) -> Result<Opener, CameraError> {
     Err(not_built(settings.driver, "v4l"))
 }
 
-#[cfg(all())]
+#[cfg(not(all(feature = "aravis", feature = "v4l")))]
 fn not_built(driver: Driver, feature: &str) -> CameraError {
     CameraError::Unsuitable(format!(
         "the driver {} is not there: this visod was built without the feature {feature}",

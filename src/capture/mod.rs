@@ -12,6 +12,7 @@
 //! | [`clock`] | a camera's stamps to the host's clock |
 //! | [`pairing`] | frames to pairs |
 //! | [`live`] | both cameras to pairs, through all that may happen to them |
+//! | [`recorder`] | pairs to a recording |
 //! | [`settings`], [`drivers`] | which cameras, and how they are opened |
 
 #[cfg(feature = "aravis")]
@@ -33,9 +34,12 @@ pub mod pace;
 pub mod pairing;
 pub mod pixels;
 pub mod read_ahead;
+pub mod recorder;
 pub mod settings;
 mod supervisor;
 mod text;
+#[cfg(feature = "v4l")]
+pub mod v4l2;
 mod yaml;
 
 pub use dataset::{Dataset, DatasetError, Layout};
