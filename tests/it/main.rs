@@ -13,6 +13,8 @@ mod frame_source;
 #[cfg(test)]
 mod mistakes;
 #[cfg(test)]
+mod one_camera;
+#[cfg(test)]
 #[cfg(feature = "opencv")]
 mod opencv;
 #[cfg(test)]
