@@ -118,6 +118,18 @@ unsafe impl Send for GigeCamera {}
 pub struct Together {
     state: Mutex<Start>,
     changed: Condvar,
+    leaves_none_out: bool,
+}
+
+impl Together {
+    /// Cameras that a busy machine makes late leave no number out, but fall behind.
+    #[must_use]
+    pub fn leaving_none_out() -> Self {
+        Self {
+            leaves_none_out: true,
+            ..Self::default()
+        }
+    }
 }
 
 #[derive(Debug, Default)]
@@ -233,6 +245,7 @@ impl Filler {
                 std::thread::sleep(Duration::from_micros(u64::try_from(wait_us).unwrap_or(0)));
                 (now_us() / self.period_us - first).max(0)
             }
+            Some(last) if self.together.leaves_none_out => last + 1,
             Some(last) => (tick - first).max(last + 1),
         };
         *last = Some(due);

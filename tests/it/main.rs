@@ -11,6 +11,9 @@ mod features;
 #[cfg(test)]
 mod frame_source;
 #[cfg(test)]
+#[cfg(all(feature = "aravis", feature = "ipc"))]
+mod gige;
+#[cfg(test)]
 mod mistakes;
 #[cfg(test)]
 mod one_camera;

@@ -12,9 +12,9 @@ use visod::simulation::{
 };
 
 /// How long a camera may take for anything; a slow machine needs a small part of it.
-const PATIENCE: Duration = Duration::from_secs(20);
-/// What a source may take beyond the patience that it is given.
-const COPYING: Duration = Duration::from_secs(3);
+const PATIENCE: Duration = Duration::from_secs(120);
+/// What a source may take beyond the patience that it is given: to render an image, on a busy machine.
+const COPYING: Duration = Duration::from_secs(30);
 
 /// Opens a camera, however often.
 pub(crate) type Open<'a> = &'a dyn Fn() -> Result<Box<dyn FrameSource>, CameraError>;

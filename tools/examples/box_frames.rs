@@ -19,9 +19,9 @@ fn pairs(path: &Path) -> Result<Vec<StereoPair>, String> {
     Ok(pairs)
 }
 
-/// Writes `left.N.raw` and `right.N.raw`, a byte a pixel.
+/// Writes the first pair as `left.0.raw` and `right.0.raw`, a byte a pixel.
 fn raw(recording: &Path, out: &Path) -> Result<(), String> {
-    for (n, pair) in pairs(recording)?.iter().enumerate() {
+    for (n, pair) in pairs(recording)?.iter().take(1).enumerate() {
         for (side, image) in [("left", &pair.left), ("right", &pair.right)] {
             let file = out.join(format!("{side}.{n}.raw"));
             std::fs::write(&file, image.pixels())

@@ -31,6 +31,9 @@ struct Args {
     /// Share of the packets that get lost.
     #[arg(long, value_name = "SHARE", default_value_t = 0.0)]
     lose: f64,
+    /// Leave no pair out where this machine is too busy for the rate: fall behind instead.
+    #[arg(long)]
+    leave_none_out: bool,
 }
 
 /// The two cameras, each plugged in or not.
@@ -100,11 +103,16 @@ fn serve(args: Args) -> Result<(), String> {
     let images = Arc::new(RecordedImages::decode(&dataset)?);
     let rate_hz = args.rate.unwrap_or(1.0 / images.period_s());
     let lose = args.lose;
+    let together = if args.leave_none_out {
+        Together::leaving_none_out()
+    } else {
+        Together::default()
+    };
     let mut cameras = Cameras {
         args,
         images,
         rate_hz,
-        together: Arc::default(),
+        together: Arc::new(together),
         plugged: [None, None],
         lose,
     };
