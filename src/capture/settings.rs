@@ -29,13 +29,13 @@ pub struct Settings {
     /// default 2: longer than any exposure or hiccup.
     pub stall_s: f64,
     /// Longest pause between two attempts to open a camera that is gone; they begin with a quarter of a
-    /// second and double. s, 0.25 to 60, default 1: back soon, without a storm of discoveries.
+    /// second and double. s, 0.25 to 60, default 0.5: back soon, without a storm of discoveries.
     pub retry_s: f64,
     /// How long a start waits for cameras that are absent or held by another program. s, 0 to 3600,
     /// default 10: a camera lets go of a killed daemon only after some seconds.
     pub patience_s: f64,
-    /// Pairs that wait for the stages before the oldest is dropped. Pairs, 1 to 64, default 1: a fresh
-    /// pair is worth more than an old one.
+    /// Pairs that wait for the stages before the oldest is dropped. Pairs, 1 to 64, default 2: rides out
+    /// a slow pair, and no more, for a fresh pair is worth more than an old one.
     pub queue: usize,
 }
 
@@ -70,9 +70,9 @@ impl Default for Settings {
             stamps: Stamps::Host,
             sigma_transit_s: 0.0001,
             stall_s: 2.0,
-            retry_s: 1.0,
+            retry_s: 0.5,
             patience_s: 10.0,
-            queue: 1,
+            queue: 2,
         }
     }
 }

@@ -3,6 +3,7 @@
 use crate::capture::camera::CameraError;
 use aravis::Camera;
 use aravis::prelude::*;
+use glib::prelude::Cast;
 use serde::Serialize;
 use std::ffi::{CStr, c_char};
 use std::sync::{Mutex, PoisonError};
@@ -119,6 +120,17 @@ pub(super) fn open(name: &str) -> Result<(Camera, Found), CameraError> {
     // Aravis itself knows names that the list does not show, and addresses beyond the next router.
     let wanted = found.map_or(name, |camera| camera.id.as_str());
     let camera = Camera::new(Some(wanted)).map_err(|e| refusal(name, &cameras, &e))?;
+    let device = camera.device();
+    // Whoever comes second may look, but not touch: said now, rather than by the first setting.
+    if let Some(device) = device
+        .as_ref()
+        .and_then(|d| d.downcast_ref::<aravis::GvDevice>())
+        && !device.is_controller()
+    {
+        return Err(CameraError::Busy(format!(
+            "{name}: another program holds it"
+        )));
+    }
     let found = match found {
         Some(found) => found.clone(),
         None => described(&camera, name),
