@@ -129,11 +129,13 @@ fn events_for(source: &mut LiveSource, time: Duration) -> Vec<PairEvent> {
 }
 
 fn pairs(events: &[PairEvent]) -> Vec<&StereoPair> {
-    let pair = |event| match event {
-        &PairEvent::Pair(ref pair) => Some(pair),
-        PairEvent::Unusable(_) => None,
-    };
-    events.iter().filter_map(pair).collect()
+    let mut pairs = Vec::new();
+    for event in events {
+        if let PairEvent::Pair(pair) = event {
+            pairs.push(pair);
+        }
+    }
+    pairs
 }
 
 /// Images of pairs show the same tick, numbers and stamps rise.

@@ -21,8 +21,11 @@ fn outcomes(pairer: &mut Pairer<u64>) -> Vec<Paired<u64>> {
     std::iter::from_fn(|| pairer.pop()).collect()
 }
 
+/// A frame that stays alone: its side, its item and why.
+type Alone = (Side, u64, &'static str);
+
 /// The items of pairs, and the sides and items of frames that stay alone.
-fn summary(outcomes: &[Paired<u64>]) -> (Vec<(u64, u64)>, Vec<(Side, u64, &'static str)>) {
+fn summary(outcomes: &[Paired<u64>]) -> (Vec<(u64, u64)>, Vec<Alone>) {
     let (mut pairs, mut alone) = (Vec::new(), Vec::new());
     for outcome in outcomes {
         match outcome {

@@ -225,7 +225,7 @@ impl Converter {
                         *out = scaled(u32::from(high) << (bits - 8) | u32::from(low) & low_mask);
                     }
                 }
-                PixelLayout::Yuyv => every_other(&row[..], out),
+                PixelLayout::Yuyv => every_other(row, out),
                 PixelLayout::Uyvy => every_other(&row[1..], out),
                 PixelLayout::Rgb8 => {
                     for (p, out) in row.chunks_exact(3).zip(out) {

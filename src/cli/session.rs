@@ -196,10 +196,8 @@ impl Session {
     /// Hands one row to everything that wants it.
     fn deliver(&mut self, delivery: &Delivery<'_>, bar: &ProgressBar) -> io::Result<OdometryRow> {
         // Latency belongs to the run, not to the recording: two replays write the same bytes.
-        let latency_ms = self
-            .live
-            .is_some()
-            .then(|| delivery.latencies.total.as_secs_f64() * 1e3);
+        let total_ms = delivery.latencies.total.as_secs_f64() * 1e3;
+        let latency_ms = self.live.is_some().then_some(total_ms);
         let row = OdometryRow::new(delivery.odometry, latency_ms);
         self.send(delivery);
         if let Some((file, csv)) = &mut self.csv {
