@@ -3,7 +3,7 @@
 //! [`Method::step`] is the whole of it. Features are extracted before, for that may be done for
 //! several images at once; everything else depends on the pair before and is done in order.
 
-use crate::capture::StereoPair;
+use crate::capture::{Skew, StereoPair};
 use crate::estimation::{
     self, Counts, MeasuredMotion, Odometer, Odometry, PairStamp, Status, StereoMeasurement,
     bundle::{Adjuster, TrackedPoint},
@@ -23,6 +23,8 @@ pub struct DescribedPair {
     pub sequence: u64,
     /// When the left image was taken, ns.
     pub timestamp_ns: i64,
+    /// How far apart in time the two images were taken.
+    pub skew: Skew,
     /// The left image's features.
     pub left: Features,
     /// The right image's features.
@@ -312,6 +314,7 @@ impl From<&StereoPair> for DescribedPair {
         Self {
             sequence: pair.sequence,
             timestamp_ns: pair.timestamp_ns,
+            skew: pair.skew,
             ..Self::default()
         }
     }
@@ -327,6 +330,7 @@ mod tests {
         DescribedPair {
             sequence,
             timestamp_ns: 100_000_000 * sequence as i64,
+            skew: Skew::default(),
             left: left.features.clone(),
             right: right.features.clone(),
         }
