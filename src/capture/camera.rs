@@ -218,6 +218,7 @@ fn nanoseconds(t: rustix::time::Timespec) -> i64 {
 }
 
 /// A camera's counter of few bits, made one that does not wrap.
+#[cfg(any(feature = "aravis", feature = "v4l", test))]
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Unwrapped {
     bits: u32,
@@ -226,6 +227,7 @@ pub(crate) struct Unwrapped {
     last: Option<(u64, u64)>,
 }
 
+#[cfg(any(feature = "aravis", feature = "v4l", test))]
 impl Unwrapped {
     pub(crate) fn new(bits: u32, skips_zero: bool) -> Self {
         Self {

@@ -38,7 +38,7 @@ fn in_namespace(test: &str) -> bool {
         return true;
     }
     let is_allowed = Command::new("unshare")
-        .args(["--map-root-user", "--net", "true"])
+        .args(["--map-root-user", "--net", "--mount", "true"])
         .stderr(Stdio::null())
         .status();
     if !is_allowed.is_ok_and(|status| status.success()) {
@@ -47,7 +47,15 @@ fn in_namespace(test: &str) -> bool {
     }
     let script = "ip link set lo up && ip addr add 127.0.0.2/8 dev lo && exec \"$@\"";
     let status = Command::new("unshare")
-        .args(["--map-root-user", "--net", "sh", "-c", script, "sh"])
+        .args([
+            "--map-root-user",
+            "--net",
+            "--mount",
+            "sh",
+            "-c",
+            script,
+            "sh",
+        ])
         .arg(std::env::current_exe().unwrap())
         .args(["--exact", test, "--nocapture"])
         .env(INSIDE, "1")
@@ -363,6 +371,42 @@ fn assert_accounted_for(recording: &Path, summary: &Value) {
             arrived <= counted && counted <= arrived + 8,
             "{side}: {arrived} of {counted}"
         );
+    }
+}
+
+/// A disk that fills up ends a recording in good order: what is written can be read.
+#[test]
+fn a_full_disk_stops_a_recording_cleanly() {
+    if !in_namespace("gige::a_full_disk_stops_a_recording_cleanly") {
+        return;
+    }
+    let rig = Rig::serve(200);
+    let folder = tempfile::tempdir().unwrap();
+    let disk = folder.path().join("disk");
+    std::fs::create_dir(&disk).unwrap();
+    let mounted = Command::new("mount")
+        .args(["-t", "tmpfs", "-o", "size=2m", "tmpfs"])
+        .arg(&disk)
+        .status();
+    assert!(mounted.unwrap().success());
+    let config = rig.config(folder.path(), None, "", "");
+    let out = disk.join("recording");
+    let output = run("record", &config, &["--json", out.to_str().unwrap()]);
+    assert_refused(&output, 1, &["cannot be written: No space left on device"]);
+    let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+    println!("{summary}");
+    let dataset = Dataset::open(&out, None).unwrap();
+    assert_eq!(Some(dataset.pairs.len() as u64), summary["pairs"].as_u64());
+    assert!(dataset.pairs.len() > 3 && !dataset.nominal_times);
+    assert_readable(&out);
+}
+
+/// Every pair of a recording can be read.
+fn assert_readable(recording: &Path) {
+    let dataset = Dataset::open(recording, None).unwrap();
+    let mut source = ReadAhead::start(&dataset).unwrap();
+    while let Some(event) = source.next_event() {
+        assert!(matches!(event, PairEvent::Pair(_)), "{event:?}");
     }
 }
 

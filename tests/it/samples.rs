@@ -104,11 +104,9 @@ fn the_sample_configuration_has_every_key_and_no_other() {
 
 #[test]
 fn commented_settings_of_the_cameras_are_the_default_where_there_is_one() {
-    let left = Config::parse(&uncommented(&sample_text()))
-        .unwrap()
-        .camera
-        .left
-        .unwrap();
+    let table: toml::Table = uncommented(&sample_text()).parse().unwrap();
+    let left: CameraSettings = table["camera"]["left"].clone().try_into().unwrap();
+    assert!(left.check().is_ok());
     let default = CameraSettings::default();
     assert_eq!(left.driver, default.driver);
     assert_eq!(left.exposure_max_ms, default.exposure_max_ms);
