@@ -55,6 +55,12 @@ impl GrayImage {
         &mut self.data
     }
 
+    /// All pixels, row by row, and the memory that they are in.
+    #[must_use]
+    pub fn into_vec(self) -> Vec<u8> {
+        self.data
+    }
+
     /// The pixels of row `y`.
     ///
     /// # Panics

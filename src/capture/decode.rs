@@ -75,6 +75,29 @@ impl Decoder {
             .map_err(|fault| fault.within(file))
     }
 
+    /// Decodes an image that is in memory already, as [`decode`](Self::decode) does; `name` stands for
+    /// the file in what goes wrong.
+    ///
+    /// # Errors
+    /// See the variants of [`DecodeError`].
+    pub fn decode_bytes(
+        &mut self,
+        name: &str,
+        bytes: &[u8],
+        expected_px: Option<(u32, u32)>,
+        image: &mut GrayImage,
+    ) -> Result<(), DecodeError> {
+        let mut target = Target {
+            expected_px,
+            white_level: self.white_level,
+            samples: &mut self.samples,
+            image,
+        };
+        target
+            .decode(bytes)
+            .map_err(|fault| fault.within(Path::new(name)))
+    }
+
     /// The width and height of the image in `file`, px, from its header.
     ///
     /// # Errors

@@ -2,23 +2,52 @@
 //!
 //! A [`PairSource`] hands out one [`PairEvent`] after the other until its recording ends. What goes
 //! wrong with one pair is an event, not the end of the run.
+//!
+//! Recordings are read pair by pair ([`ReadAhead`]); two cameras become one in [`LiveSource`]:
+//!
+//! | module | does |
+//! |---|---|
+//! | [`camera`] | what one camera is: the trait that files, a simulation, `aravis` and `v4l2` keep to |
+//! | [`pixels`] | raw pixels to grey |
+//! | [`clock`] | a camera's stamps to the host's clock |
+//! | [`pairing`] | frames to pairs |
+//! | [`live`] | both cameras to pairs, through all that may happen to them |
+//! | [`recorder`] | pairs to a recording |
+//! | [`settings`], [`drivers`] | which cameras, and how they are opened |
 
+#[cfg(feature = "aravis")]
+pub mod aravis;
+pub mod camera;
+pub mod clock;
 pub mod dataset;
 pub mod decode;
 mod decode_error;
+pub mod drivers;
 mod euroc;
 mod euroc_frames;
+pub mod files;
 mod jpeg;
 mod kitti;
+pub mod live;
 mod own;
 pub mod pace;
+pub mod pairing;
+pub mod pixels;
 pub mod read_ahead;
+pub mod recorder;
+pub mod settings;
+mod supervisor;
 mod text;
+#[cfg(feature = "v4l")]
+pub mod v4l2;
 mod yaml;
 
 pub use dataset::{Dataset, DatasetError, Layout};
+pub use live::LiveSource;
 pub use pace::Realtime;
+pub use pairing::Skew;
 pub use read_ahead::ReadAhead;
+pub use supervisor::Opener;
 
 use crate::image::GrayImage;
 
@@ -32,12 +61,14 @@ pub enum Side {
 }
 
 /// Two images taken at the same instant, raw: neither undistorted nor rectified.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub struct StereoPair {
     /// The number of the pair in its recording, counted from 0, unusable pairs included.
     pub sequence: u64,
     /// When the left image was taken, ns, in the recording's own clock.
     pub timestamp_ns: i64,
+    /// How far apart in time the two were taken; none in a recording.
+    pub skew: Skew,
     /// The left camera's image.
     pub left: GrayImage,
     /// The right camera's image.
@@ -56,7 +87,7 @@ pub struct Unusable {
 }
 
 /// What a source hands out.
-#[derive(Clone, Debug, PartialEq, Eq)]
+#[derive(Clone, Debug, PartialEq)]
 pub enum PairEvent {
     /// A pair, ready for the stages.
     Pair(StereoPair),

@@ -93,6 +93,7 @@ impl PairSource for ReadAhead {
             (Ok(left), Ok(right)) => Some(PairEvent::Pair(StereoPair {
                 sequence,
                 timestamp_ns,
+                skew: crate::capture::Skew::default(),
                 left,
                 right,
             })),

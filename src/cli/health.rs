@@ -1,5 +1,6 @@
 //! The state of a run, as `visod/health` tells it.
 
+use crate::capture::live::{Snapshot, State};
 use crate::estimation::Status;
 use crate::output::health::{CameraState, HealthMessage};
 use crate::output::message::status_code;
@@ -17,6 +18,7 @@ pub(crate) struct Health {
     changed: bool,
     published: Option<Instant>,
     busy_total: Duration,
+    camera_states: (u32, u32),
 }
 
 impl Health {
@@ -44,6 +46,31 @@ impl Health {
         m.pairs_degraded += u64::from(odometry.status == Status::Degraded);
         m.busy_max_ns = m.busy_max_ns.max(ns(busy));
         m.busy_mean_ns = ns(self.busy_total) / m.pairs_processed;
+    }
+
+    /// Takes note of how the cameras are.
+    pub(crate) fn add_cameras(&mut self, cameras: &Snapshot) {
+        let state = |state: State| match state {
+            State::Opening => CameraState::Opening,
+            State::Streaming => CameraState::Streaming,
+            State::Stalled => CameraState::Stalled,
+            State::Lost => CameraState::Lost,
+        } as u32;
+        let [left, right] = &cameras.cameras;
+        let m = &mut self.message;
+        let states = (state(left.state), state(right.state));
+        self.changed |= states != self.camera_states;
+        self.camera_states = states;
+        (m.left_state, m.right_state) = states;
+        (m.left_frames, m.right_frames) = (left.frames, right.frames);
+        (m.left_reconnects, m.right_reconnects) = (left.reconnects, right.reconnects);
+        (m.left_last_monotonic_ns, m.right_last_monotonic_ns) =
+            (left.last_arrived_ns, right.last_arrived_ns);
+        (m.left_lost_in_transport, m.right_lost_in_transport) =
+            (left.losses.in_transport(), right.losses.in_transport());
+        (m.left_unreadable, m.right_unreadable) = (left.losses.unusable(), right.losses.unusable());
+        (m.left_unmatched, m.right_unmatched) = (left.unmatched, right.unmatched);
+        m.pairs_dropped = cameras.dropped;
     }
 
     /// The message, with what the publisher knows.

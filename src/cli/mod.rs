@@ -1,16 +1,21 @@
 //! The command line: one file a command.
 
+mod cameras;
+mod check;
 mod demo;
 mod evaluate;
 mod features;
 #[cfg(feature = "ipc")]
 mod health;
 mod listen;
+mod live;
 mod montecarlo;
 mod progress;
+mod record;
 mod replay;
 mod report;
 mod rig;
+mod run;
 mod session;
 mod simulate;
 mod summary;
@@ -34,7 +39,9 @@ struct Cli {
 #[derive(Subcommand)]
 enum Command {
     Demo(demo::Args),
+    Run(run::Args),
     Replay(replay::Args),
+    Record(record::Args),
     Simulate(Box<simulate::Args>),
     Listen(listen::Args),
     Evaluate(evaluate::Args),
@@ -42,6 +49,8 @@ enum Command {
     Features(features::Args),
     Montecarlo(Box<montecarlo::Args>),
     Rig(rig::Args),
+    Cameras(cameras::Args),
+    Check(check::Args),
 }
 
 /// Why a command did not do what it was asked to.
@@ -70,7 +79,9 @@ impl Failure {
 pub fn main() -> ExitCode {
     let result = match Cli::parse().command {
         Command::Demo(args) => demo::run(&args),
+        Command::Run(args) => run::run(&args),
         Command::Replay(args) => replay::run(&args),
+        Command::Record(args) => record::run(&args),
         Command::Simulate(args) => simulate::run(&args),
         Command::Listen(args) => listen::run(&args),
         Command::Evaluate(args) => evaluate::run(&args),
@@ -78,6 +89,8 @@ pub fn main() -> ExitCode {
         Command::Features(args) => features::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
         Command::Rig(args) => rig::run(&args),
+        Command::Cameras(args) => cameras::run(&args),
+        Command::Check(args) => check::run(&args),
     };
     match result {
         Ok(()) => ExitCode::SUCCESS,

@@ -4,6 +4,7 @@
 use super::health::Health;
 use super::{Failure, progress};
 use crate::capture::PairSource;
+use crate::capture::live::{Monitor, Snapshot};
 use crate::config::Config;
 use crate::features;
 use crate::geometry::{Severity, StereoRig, check_rig};
@@ -36,6 +37,7 @@ pub(crate) struct Session {
     published: u64,
     publish_failures: u64,
     each_row: Option<RowWatcher>,
+    live: Option<Monitor>,
 }
 
 /// What a run came to.
@@ -52,6 +54,8 @@ pub(crate) struct Finished {
     pub(crate) publish_failures: u64,
     /// Why the first unusable pair was not usable.
     pub(crate) first_unusable: Option<String>,
+    /// What became of the cameras, where there were any.
+    pub(crate) cameras: Option<Snapshot>,
 }
 
 impl Session {
@@ -80,7 +84,13 @@ impl Session {
             published: 0,
             publish_failures: 0,
             each_row: None,
+            live: None,
         }
+    }
+
+    /// The pairs come from cameras: their own times go out, and their state.
+    pub(crate) fn watch(&mut self, cameras: Monitor) {
+        self.live = Some(cameras);
     }
 
     /// Writes the odometry CSV.
@@ -143,12 +153,14 @@ impl Session {
                 delivery.unusable.is_none(),
             );
             if let Some(why) = delivery.unusable {
-                bar.suspend(|| {
-                    eprintln!(
-                        "visod: warning: pair {} is not usable: {why}",
-                        delivery.odometry.sequence
-                    );
-                });
+                let sequence = delivery.odometry.sequence;
+                // Cameras say themselves what happens to them, once and not for each pair.
+                match self.live {
+                    Some(_) => tracing::debug!(sequence, why, "pair not usable"),
+                    None => bar.suspend(|| {
+                        eprintln!("visod: warning: pair {sequence} is not usable: {why}");
+                    }),
+                }
                 first_unusable.get_or_insert_with(|| why.to_owned());
             }
             last = Some(self.deliver(&delivery, &bar)?);
@@ -167,8 +179,12 @@ impl Session {
         if let Some(publisher) = self.publisher {
             publisher.close();
         }
+        let cameras = self.live.as_ref().map(Monitor::snapshot);
+        let mut figures = statistics.figures();
+        figures.counts.dropped = cameras.as_ref().map_or(0, |c| c.dropped);
         Ok(Finished {
-            figures: statistics.figures(),
+            figures,
+            cameras,
             rows: self.rows.unwrap_or_default(),
             last,
             published: self.published,
@@ -180,7 +196,9 @@ impl Session {
     /// Hands one row to everything that wants it.
     fn deliver(&mut self, delivery: &Delivery<'_>, bar: &ProgressBar) -> io::Result<OdometryRow> {
         // Latency belongs to the run, not to the recording: two replays write the same bytes.
-        let row = OdometryRow::new(delivery.odometry, None);
+        let total_ms = delivery.latencies.total.as_secs_f64() * 1e3;
+        let latency_ms = self.live.is_some().then_some(total_ms);
+        let row = OdometryRow::new(delivery.odometry, latency_ms);
         self.send(delivery);
         if let Some((file, csv)) = &mut self.csv {
             csv.write_row(&row)
@@ -203,8 +221,9 @@ impl Session {
 
     #[cfg(feature = "ipc")]
     fn send(&mut self, delivery: &Delivery<'_>) {
-        use crate::output::message::{CaptureTime, OdometryMessage};
+        use crate::output::message::OdometryMessage;
 
+        let captured = self.captured(delivery);
         let Some(publisher) = &mut self.publisher else {
             return;
         };
@@ -212,8 +231,8 @@ impl Session {
         let message = OdometryMessage::new(
             delivery.odometry,
             mounting.filter(|_| self.config.publish.base_frame),
-            CaptureTime::Recorded(delivery.odometry.timestamp_ns),
-            latencies(&delivery.latencies),
+            captured.0,
+            latencies(&delivery.latencies, captured.1),
         );
         match publisher.publish(&message) {
             Ok(_) => self.published += 1,
@@ -225,6 +244,9 @@ impl Session {
             }
         }
         self.health.add(delivery);
+        if let Some(live) = &self.live {
+            self.health.add_cameras(&live.snapshot());
+        }
         if self.health.is_due() {
             let message = self
                 .health
@@ -234,16 +256,40 @@ impl Session {
         }
     }
 
+    /// When a pair was taken, and how long it took to be complete, ns.
+    #[cfg(feature = "ipc")]
+    fn captured(&self, delivery: &Delivery<'_>) -> (crate::output::message::CaptureTime, u64) {
+        use crate::capture::camera::{monotonic_ns, realtime_ns};
+        use crate::output::message::CaptureTime;
+
+        let odometry = delivery.odometry;
+        let Some(live) = &self.live else {
+            return (CaptureTime::Recorded(odometry.timestamp_ns), 0);
+        };
+        let now_ns = monotonic_ns();
+        let (taken_ns, complete_ns) = live
+            .captured(odometry.sequence)
+            .map_or((now_ns, now_ns), |at| (at.monotonic_ns, at.complete_ns));
+        let captured = CaptureTime::Live {
+            realtime_ns: realtime_ns() - (now_ns - taken_ns),
+            monotonic_ns: taken_ns,
+        };
+        (captured, u64::try_from(complete_ns - taken_ns).unwrap_or(0))
+    }
+
     #[cfg(not(feature = "ipc"))]
     fn send(&mut self, _: &Delivery<'_>) {}
 }
 
 /// The stages' latencies as the message has them.
 #[cfg(feature = "ipc")]
-fn latencies(took: &pipeline::StageLatencies) -> crate::output::message::Latencies {
+fn latencies(
+    took: &pipeline::StageLatencies,
+    capture_ns: u64,
+) -> crate::output::message::Latencies {
     let ns = |d: std::time::Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
     crate::output::message::Latencies {
-        capture_ns: 0,
+        capture_ns,
         features_ns: ns(took.features),
         matching_ns: ns(took.matching),
         estimation_ns: ns(took.estimation),

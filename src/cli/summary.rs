@@ -2,6 +2,7 @@
 
 use super::Failure;
 use super::session::{Finished, unwritable};
+use crate::capture::live::{CameraStatus, Snapshot};
 use crate::evaluation::{self, Trajectory};
 use crate::output::report;
 use crate::output::row::OdometryRow;
@@ -18,6 +19,56 @@ struct Summary<'a> {
     publish_failures: u64,
     end_position_m: Option<[f64; 3]>,
     end_sigma_m: Option<[f64; 3]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    cameras: Option<[CameraSummary<'a>; 2]>,
+}
+
+/// One camera in it.
+#[derive(serde::Serialize)]
+struct CameraSummary<'a> {
+    side: &'static str,
+    identity: &'a str,
+    state: &'static str,
+    frames: u64,
+    unmatched: u64,
+    reconnects: u64,
+    clock_steps: u64,
+    lost: std::collections::BTreeMap<&'static str, u64>,
+}
+
+impl<'a> CameraSummary<'a> {
+    fn of(side: &'static str, camera: &'a CameraStatus) -> Self {
+        Self {
+            side,
+            identity: &camera.identity,
+            state: camera.state.as_str(),
+            frames: camera.frames,
+            unmatched: camera.unmatched,
+            reconnects: camera.reconnects,
+            clock_steps: camera.clock_steps,
+            lost: camera.losses.iter().map(|(k, n)| (k.as_str(), n)).collect(),
+        }
+    }
+}
+
+/// A line a camera: how many frames came, and what became of the others.
+pub(crate) fn cameras_to_text(cameras: &Snapshot) -> String {
+    let mut text = String::new();
+    for (side, camera) in ["left", "right"].into_iter().zip(&cameras.cameras) {
+        let lost = camera.losses.iter().filter(|(_, frames)| *frames > 0);
+        let lost: Vec<String> = lost.map(|(k, n)| format!(", {n} {}", k.as_str())).collect();
+        // Writing to a String cannot fail.
+        let _ = writeln!(
+            text,
+            "  {side:<6} {}: {} frames, {} unmatched{}, opened anew {} times",
+            camera.identity,
+            camera.frames,
+            camera.unmatched,
+            lost.concat(),
+            camera.reconnects
+        );
+    }
+    text
 }
 
 /// The summary as JSON.
@@ -29,6 +80,13 @@ pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result
         publish_failures: finished.publish_failures,
         end_position_m: finished.last.as_ref().map(position_m),
         end_sigma_m: finished.last.as_ref().map(sigma_m),
+        cameras: finished.cameras.as_ref().map(|cameras| {
+            let [left, right] = &cameras.cameras;
+            [
+                CameraSummary::of("left", left),
+                CameraSummary::of("right", right),
+            ]
+        }),
     })
 }
 
@@ -62,6 +120,9 @@ pub(crate) fn to_text(finished: &Finished) -> String {
             "  {:<10} median {:>8.2} ms   p99 {:>8.2} ms",
             stage.stage, stage.median, stage.p99
         );
+    }
+    if let Some(cameras) = &finished.cameras {
+        text += &cameras_to_text(cameras);
     }
     text
 }

@@ -15,6 +15,10 @@ use std::path::{Path, PathBuf};
 pub struct Config {
     /// The rig file; relative to the configuration's own folder. Default: the recording's own.
     pub rig: Option<PathBuf>,
+    /// The two cameras.
+    pub camera: capture::settings::Cameras,
+    /// How their frames become pairs.
+    pub capture: capture::settings::Settings,
     /// How recordings are read.
     pub dataset: capture::dataset::Settings,
     /// How features are found.
@@ -54,6 +58,9 @@ impl Config {
     fn from_text(text: &TomlText) -> Result<Self, TomlError> {
         let config: Self = text.parse()?;
         for (table, checked) in [
+            ("camera.left", check_camera(config.camera.left.as_ref())),
+            ("camera.right", check_camera(config.camera.right.as_ref())),
+            ("capture", config.capture.check()),
             ("dataset", config.dataset.check()),
             ("features.surf", config.features.surf.check()),
             #[cfg(feature = "opencv")]
@@ -70,6 +77,10 @@ impl Config {
         }
         Ok(config)
     }
+}
+
+fn check_camera(camera: Option<&capture::settings::CameraSettings>) -> Result<(), SettingError> {
+    camera.map_or(Ok(()), capture::settings::CameraSettings::check)
 }
 
 #[cfg(test)]

@@ -10,7 +10,7 @@
 //! under way at once: their buffers go round, so that nothing is allocated after the first few.
 
 use super::method::{Described, DescribedPair, Method};
-use crate::capture::{PairEvent, PairSource, Side, StereoPair, Unusable};
+use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
 use crate::image::GrayImage;
@@ -141,6 +141,7 @@ struct Spare {
 struct Job {
     ticket: u64,
     stamp: PairStamp,
+    skew: Skew,
     arrived: Instant,
     side: Side,
     image: GrayImage,
@@ -189,9 +190,11 @@ fn feed<S: PairSource>(
                     sequence: pair.sequence,
                     timestamp_ns: pair.timestamp_ns,
                 };
+                let skew = pair.skew;
                 let job = |side, image, described| Job {
                     ticket,
                     stamp,
+                    skew,
                     arrived,
                     side,
                     image,
@@ -348,6 +351,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
             *described = DescribedPair {
                 sequence: stamp.sequence,
                 timestamp_ns: stamp.timestamp_ns,
+                skew: left.job.skew,
                 left: left.job.described,
                 right: right.job.described,
             };
@@ -373,6 +377,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                     used: Some(StereoPair {
                         sequence: stamp.sequence,
                         timestamp_ns: stamp.timestamp_ns,
+                        skew: left.job.skew,
                         left: left.job.image,
                         right: right.job.image,
                     }),

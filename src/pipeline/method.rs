@@ -6,7 +6,7 @@
 
 use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
-use crate::capture::StereoPair;
+use crate::capture::{Skew, StereoPair};
 use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement};
 use crate::features::Features;
 use crate::geometry::{Rectification, StereoRig};
@@ -33,6 +33,8 @@ pub struct DescribedPair {
     pub sequence: u64,
     /// When the left image was taken, ns.
     pub timestamp_ns: i64,
+    /// How far apart in time the two images were taken.
+    pub skew: Skew,
     /// The left image's.
     pub left: Described,
     /// The right image's.
@@ -249,6 +251,7 @@ impl From<&StereoPair> for DescribedPair {
         Self {
             sequence: pair.sequence,
             timestamp_ns: pair.timestamp_ns,
+            skew: pair.skew,
             ..Self::default()
         }
     }
@@ -265,6 +268,7 @@ mod tests {
         DescribedPair {
             sequence,
             timestamp_ns: 100_000_000 * sequence as i64,
+            skew: Skew::default(),
             left: Described {
                 features: left.features.clone(),
                 ..Described::default()

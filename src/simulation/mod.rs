@@ -15,7 +15,10 @@
 //! [`points`] simulates on the level of feature points instead: no images, thousands of times
 //! faster.
 
+mod camera;
 mod dataset_writer;
+#[cfg(feature = "aravis")]
+pub mod gige;
 mod kernel;
 mod material;
 mod pattern;
@@ -30,6 +33,7 @@ mod texture;
 mod trajectory;
 mod view;
 
+pub use camera::SimulatedCamera;
 pub use dataset_writer::{DatasetError, DatasetWriter};
 pub use render::SIGMA_PX;
 pub use scene::Scene;
@@ -236,6 +240,7 @@ impl Simulation {
         let pair = StereoPair {
             sequence: frame,
             timestamp_ns: self.timestamp_ns(frame),
+            skew: crate::capture::Skew::default(),
             left: self.image(frame, Side::Left),
             right: self.image(frame, Side::Right),
         };

@@ -11,9 +11,14 @@ mod features;
 #[cfg(test)]
 mod frame_source;
 #[cfg(test)]
+#[cfg(all(feature = "aravis", feature = "ipc"))]
+mod gige;
+#[cfg(test)]
 mod mistakes;
 #[cfg(test)]
 mod montecarlo;
+#[cfg(test)]
+mod one_camera;
 #[cfg(test)]
 #[cfg(feature = "opencv")]
 mod opencv;

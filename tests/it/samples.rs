@@ -3,6 +3,7 @@
 use super::replay::{stderr_of, visod};
 use std::collections::BTreeSet;
 use std::path::{Path, PathBuf};
+use visod::capture::settings::{CameraSettings, ControlValue};
 use visod::config::Config;
 use visod::geometry::{check_rig, load_rig};
 
@@ -55,6 +56,18 @@ fn all_keys() -> BTreeSet<String> {
         rig: Some("rig.toml".into()),
         ..Config::default()
     };
+    // The right camera's keys are the left one's; the sample repeats only its name.
+    config.camera.left = Some(CameraSettings {
+        id: "PointGrey-11223344".to_owned(),
+        pixel_format: Some("Mono8".to_owned()),
+        frame_rate_hz: Some(20.0),
+        exposure_ms: Some(5.0),
+        gain: Some(0.0),
+        packet_size: Some(1500),
+        white_level: Some(4095),
+        controls: [("BlackLevel".to_owned(), ControlValue::Integer(0))].into(),
+        ..CameraSettings::default()
+    });
     config.publish.root = Some("/run/visod".into());
     config.publish.prefix = Some("robot1_".to_owned());
     keys(&toml::Table::try_from(config).unwrap())
@@ -79,13 +92,28 @@ fn the_sample_configuration_has_every_key_and_no_other() {
     };
     assert_eq!(in_force, without_opencv(&defaults));
 
-    let offered = keys(&uncommented(&sample_text()).parse().unwrap());
+    let mut offered = keys(&uncommented(&sample_text()).parse().unwrap());
+    assert!(offered.remove("camera.right.id"));
     let all = all_keys();
     if cfg!(feature = "opencv") {
         assert_eq!(offered, all);
     } else {
         assert_eq!(without_opencv(&offered), all);
     }
+}
+
+#[test]
+fn commented_settings_of_the_cameras_are_the_default_where_there_is_one() {
+    let table: toml::Table = uncommented(&sample_text()).parse().unwrap();
+    let left: CameraSettings = table["camera"]["left"].clone().try_into().unwrap();
+    assert!(left.check().is_ok());
+    let default = CameraSettings::default();
+    assert_eq!(left.driver, default.driver);
+    assert_eq!(left.exposure_max_ms, default.exposure_max_ms);
+    assert_eq!(left.trigger, default.trigger);
+    assert_eq!(left.trigger_source, default.trigger_source);
+    assert_eq!(left.offset_px, default.offset_px);
+    assert_eq!(left.buffers, default.buffers);
 }
 
 #[cfg(feature = "opencv")]

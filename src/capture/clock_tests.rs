@@ -1,0 +1,252 @@
+use super::*;
+use rand::{RngExt, SeedableRng};
+use rand_distr::{Distribution, Exp1, Gamma};
+use rand_xoshiro::Xoshiro256PlusPlus;
+
+const PERIOD_NS: i64 = 50_000_000;
+const START_NS: i64 = 9_000_000_000_000;
+const LEAST_DELAY_NS: f64 = 400_000.0;
+
+/// How long frames are held up beyond the least delay.
+#[derive(Clone, Copy, Debug)]
+enum Delays {
+    Exponential,
+    Uniform,
+    Gamma,
+}
+
+/// A camera whose clock runs faster or slower, with frames that arrive late.
+struct Camera {
+    rng: Xoshiro256PlusPlus,
+    drift: f64,
+    offset_ns: i64,
+    delays: Delays,
+    mean_delay_ns: f64,
+}
+
+impl Camera {
+    fn new(seed: u64, drift: f64, offset_ns: i64) -> Self {
+        Self {
+            rng: Xoshiro256PlusPlus::seed_from_u64(seed),
+            drift,
+            offset_ns,
+            delays: Delays::Exponential,
+            mean_delay_ns: 1e6,
+        }
+    }
+
+    /// The stamp and arrival of a frame taken at a host time.
+    fn frame(&mut self, taken_ns: i64) -> (i64, i64) {
+        let camera_ns = taken_ns - START_NS
+            + self.offset_ns
+            + (self.drift * (taken_ns - START_NS) as f64) as i64;
+        let held_up = match self.delays {
+            Delays::Exponential => Distribution::<f64>::sample(&Exp1, &mut self.rng),
+            Delays::Uniform => 2.0 * self.rng.random::<f64>(),
+            Delays::Gamma => Gamma::new(1.5, 1.0 / 1.5)
+                .expect("valid")
+                .sample(&mut self.rng),
+        };
+        let delay_ns = LEAST_DELAY_NS + self.mean_delay_ns * held_up;
+        (camera_ns, taken_ns + delay_ns as i64)
+    }
+}
+
+fn taken(n: i64) -> i64 {
+    START_NS + n * PERIOD_NS
+}
+
+/// The errors in σ after each of `at` frames, of many cameras.
+fn normalised_errors(delays: Delays, at: i64) -> Vec<f64> {
+    (0..200)
+        .map(|seed| {
+            let mut camera = Camera::new(seed, 50e-6, 3_000_000);
+            camera.delays = delays;
+            let mut clock = ClockMap::new();
+            let mut error = 0.0;
+            for n in 0..=at {
+                let (camera_ns, arrived_ns) = camera.frame(taken(n));
+                let mapped = clock.map(camera_ns, arrived_ns);
+                let truth = taken(n) as f64 + LEAST_DELAY_NS;
+                error = (mapped.host_ns as f64 - truth) / mapped.sigma_ns;
+            }
+            error
+        })
+        .collect()
+}
+
+/// σ is honest: neither so small that errors leave it, nor so large that it says nothing.
+#[test]
+fn stated_sigmas_hold_for_any_delays_at_any_time() {
+    for delays in [Delays::Exponential, Delays::Uniform, Delays::Gamma] {
+        for at in [3, 10, 30, 100, 300, 1200] {
+            let errors = normalised_errors(delays, at);
+            let n = errors.len() as f64;
+            let rms = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+            let beyond = errors.iter().filter(|e| e.abs() > 3.0).count() as f64 / n;
+            println!("{delays:?} after {at}: rms {rms:.2} σ, {beyond:.3} beyond 3 σ");
+            assert!(rms < 1.7, "{delays:?} after {at}: rms {rms} σ");
+            assert!(beyond < 0.05, "{delays:?} after {at}: {beyond} beyond 3 σ");
+            if at >= 30 {
+                assert!(rms > 0.2, "{delays:?} after {at}: rms {rms} σ says nothing");
+            }
+        }
+    }
+}
+
+#[test]
+fn the_drift_is_found_within_its_sigma() {
+    for (seed, drift) in [(1, 50e-6), (2, -50e-6), (3, 0.0), (4, 120e-6)] {
+        let mut camera = Camera::new(seed, drift, 0);
+        let mut clock = ClockMap::new();
+        for n in 0..2400 {
+            let (camera_ns, arrived_ns) = camera.frame(taken(n));
+            clock.map(camera_ns, arrived_ns);
+        }
+        let fit = clock.fit().expect("a fit");
+        // The host's clock by the camera's is the inverse of the camera's by the host's.
+        let expected = 1.0 / (1.0 + drift) - 1.0;
+        let off = (fit.drift() - expected).abs();
+        assert!(
+            off < 3.0 * fit.sigma_drift(),
+            "{off} with σ {}",
+            fit.sigma_drift()
+        );
+        assert!(fit.sigma_drift() < 3e-6, "{}", fit.sigma_drift());
+    }
+}
+
+/// Two cameras whose clocks differ by 3 ms and 50 ppm: the estimate of their offset is within its σ.
+#[test]
+fn the_offset_between_two_cameras_is_found_within_its_sigma() {
+    let mut normalised = Vec::new();
+    for seed in 0..40 {
+        let mut cameras = [
+            Camera::new(seed, 0.0, 0),
+            Camera::new(1000 + seed, 50e-6, 3_000_000),
+        ];
+        let mut clocks = [ClockMap::new(), ClockMap::new()];
+        let mut last = [None; 2];
+        for n in 0..1200 {
+            for side in 0..2 {
+                let (camera_ns, arrived_ns) = cameras[side].frame(taken(n));
+                last[side] = Some(clocks[side].map(camera_ns, arrived_ns));
+            }
+        }
+        let [left, right] = last.map(|m| m.expect("mapped"));
+        // Taken at the same instant: any difference is error.
+        let difference = (right.host_ns - left.host_ns) as f64;
+        let sigma = left.sigma_ns.hypot(right.sigma_ns);
+        assert!(sigma < 100_000.0, "{sigma} ns says nothing");
+        normalised.push(difference / sigma);
+    }
+    let within = |sigmas: f64| normalised.iter().filter(|z| z.abs() < sigmas).count();
+    assert_eq!(within(3.0), 40);
+    assert!(within(1.0) >= 24, "{}", within(1.0));
+}
+
+#[test]
+fn a_clock_of_few_bits_wraps_and_nothing_is_lost() {
+    for modulus_ns in WRAPS_NS {
+        let mut camera = Camera::new(7, 20e-6, modulus_ns - 20 * PERIOD_NS - 777);
+        let mut clock = ClockMap::new();
+        let mut events = Vec::new();
+        for n in 0..200 {
+            let (camera_ns, arrived_ns) = camera.frame(taken(n));
+            let mapped = clock.map(camera_ns.rem_euclid(modulus_ns), arrived_ns);
+            events.extend(mapped.event);
+            let error = mapped.host_ns as f64 - (taken(n) as f64 + LEAST_DELAY_NS);
+            assert!(error.abs() < 4.0 * mapped.sigma_ns, "frame {n}: {error} ns");
+        }
+        assert!(!events.is_empty());
+        for event in events {
+            assert_eq!(event, ClockEvent::Wrapped { modulus_ns });
+        }
+    }
+}
+
+#[test]
+fn a_camera_that_restarts_is_recognised_at_once() {
+    let mut camera = Camera::new(8, 20e-6, 700_000_000_123);
+    let mut clock = ClockMap::new();
+    for n in 0..100 {
+        if n == 60 {
+            camera.offset_ns = -60 * PERIOD_NS;
+        }
+        let (camera_ns, arrived_ns) = camera.frame(taken(n));
+        let mapped = clock.map(camera_ns, arrived_ns);
+        assert_eq!(
+            matches!(mapped.event, Some(ClockEvent::Stepped { .. })),
+            n == 60,
+            "frame {n}: {mapped:?}"
+        );
+        let error = mapped.host_ns as f64 - (taken(n) as f64 + LEAST_DELAY_NS);
+        assert!(error.abs() < 5.0 * mapped.sigma_ns, "frame {n}: {error} ns");
+    }
+}
+
+#[test]
+fn a_clock_that_is_set_ahead_is_recognised_at_once_and_one_set_back_soon() {
+    for (step_ns, within) in [(2_000_000_000, 0), (40_000_000, 0), (-149_000_000, 12)] {
+        let mut camera = Camera::new(9, 20e-6, 5_000_000_000);
+        let mut clock = ClockMap::new();
+        let mut recognised = None;
+        for n in 0..160 {
+            if n == 100 {
+                camera.offset_ns += step_ns;
+            }
+            let (camera_ns, arrived_ns) = camera.frame(taken(n));
+            let mapped = clock.map(camera_ns, arrived_ns);
+            if let Some(ClockEvent::Stepped { by_ns }) = mapped.event {
+                assert!(
+                    (by_ns - step_ns).abs() < 60_000_000,
+                    "{by_ns} for {step_ns}"
+                );
+                assert_eq!(recognised, None);
+                recognised = Some(n);
+            }
+        }
+        let recognised = recognised.expect("recognised");
+        assert!(
+            (100..=100 + within).contains(&recognised),
+            "{recognised} for {step_ns}"
+        );
+    }
+}
+
+/// A busy host hands over a backlog: late, but no step.
+#[test]
+fn a_backlog_is_no_step() {
+    let mut camera = Camera::new(10, 20e-6, 0);
+    let mut clock = ClockMap::new();
+    for n in 0..300 {
+        let (camera_ns, arrived_ns) = camera.frame(taken(n));
+        let held = (100..140).contains(&n);
+        let arrived_ns = if held {
+            arrived_ns.max(taken(140) + n * 1000)
+        } else {
+            arrived_ns
+        };
+        let mapped = clock.map(camera_ns, arrived_ns);
+        assert_eq!(mapped.event, None, "frame {n}");
+        let error = mapped.host_ns as f64 - (taken(n) as f64 + LEAST_DELAY_NS);
+        assert!(
+            n < 20 || error.abs() < 5.0 * mapped.sigma_ns,
+            "frame {n}: {error} ns"
+        );
+    }
+}
+
+#[test]
+fn mapped_stamps_rise() {
+    let mut camera = Camera::new(11, -80e-6, 0);
+    camera.mean_delay_ns = 20e6;
+    let mut clock = ClockMap::new();
+    let mut last = i64::MIN;
+    for n in 0..500 {
+        let (camera_ns, arrived_ns) = camera.frame(START_NS + n * 2_000_000);
+        let mapped = clock.map(camera_ns, arrived_ns);
+        assert!(mapped.event.is_some() || mapped.host_ns > last, "frame {n}");
+        last = mapped.host_ns;
+    }
+}

@@ -1,0 +1,82 @@
+//! `visod run`: the daemon. Cameras in, poses over shared memory out, until it is told to stop.
+
+use super::live::{Setup, Stop, log_to_stderr};
+use super::session::{Session, unwritable};
+use super::{Failure, summary};
+use crate::capture::live::{Delivery, Overflow};
+use std::path::PathBuf;
+
+/// Follow two cameras and publish pose and covariance until stopped.
+///
+/// The configuration names the rig and the cameras: `rig`, `[camera.left]` and `[camera.right]`. A
+/// camera that fails is opened anew while the other one and the publication go on. Stopped by SIGINT
+/// (Ctrl-C) or SIGTERM, it prints what the run came to.
+#[derive(clap::Args)]
+#[command(after_help = "Example: visod run --config visod.toml")]
+pub(crate) struct Args {
+    /// The configuration.
+    #[arg(long, value_name = "FILE")]
+    config: PathBuf,
+    /// Write the odometry as CSV.
+    #[arg(long, value_name = "F.csv")]
+    odometry: Option<PathBuf>,
+    /// Write the trajectory in TUM format.
+    #[arg(long, value_name = "F.txt")]
+    trajectory: Option<PathBuf>,
+    /// Write the run's figures as JSON.
+    #[arg(long, value_name = "F.json")]
+    summary: Option<PathBuf>,
+    /// Stop after that many seconds.
+    #[arg(long, value_name = "S")]
+    seconds: Option<f64>,
+    /// Do not publish over shared memory.
+    #[arg(long)]
+    no_publish: bool,
+    /// Print the run's figures as JSON.
+    #[arg(long)]
+    json: bool,
+}
+
+pub(crate) fn run(args: &Args) -> Result<(), Failure> {
+    log_to_stderr();
+    let stop = Stop::on_signals()?;
+    let setup = Setup::load(&args.config)?;
+    let mut session = Session::new(setup.config.clone(), setup.rig.clone());
+    session.write_csv(args.odometry.as_deref())?;
+    session.write_trajectory(args.trajectory.as_deref())?;
+    if !args.no_publish {
+        publish(&mut session)?;
+    }
+    let delivery = Delivery {
+        queue: setup.config.capture.queue,
+        overflow: Overflow::Oldest,
+        keeps_journal: false,
+    };
+    let source = setup.open(delivery, &stop)?;
+    session.watch(source.monitor());
+    stop.end_run(source.monitor(), args.seconds)?;
+    let finished = session.run(source)?;
+    let json = summary::to_json(&args.config, &finished).map_err(Failure::other)?;
+    if let Some(file) = &args.summary {
+        std::fs::write(file, format!("{json}\n")).map_err(|e| unwritable(file, &e))?;
+    }
+    if args.json {
+        println!("{json}");
+    } else {
+        print!("{}", summary::to_text(&finished));
+    }
+    Ok(())
+}
+
+/// Publishing is what the daemon is for: without, it does not start.
+#[cfg(feature = "ipc")]
+fn publish(session: &mut Session) -> Result<(), Failure> {
+    session.publish().map(drop).map_err(Failure::other)
+}
+
+#[cfg(not(feature = "ipc"))]
+fn publish(_: &mut Session) -> Result<(), Failure> {
+    Err(Failure::usage(
+        "this visod was built without the feature ipc and cannot publish: run it with --no-publish",
+    ))
+}
