@@ -4,7 +4,11 @@
 //! determinant is above the threshold and above all 26 neighbours in row, column and layer; a
 //! quadratic through these 27 then gives place and size between the samples (Brown and Lowe,
 //! *Invariant Features from Interest Point Groups*, 2002), and a candidate whose top lies more than
-//! one sample away is none. Only three rows of each layer are ever held.
+//! one sample away is none.
+//!
+//! The lowest and the highest layer of an octave hold no keypoints, so they are computed where a
+//! sample of the layer beside them is the highest so far, and nowhere else. Of the other layers
+//! only three rows are ever held.
 
 use super::Keypoint;
 use super::hessian::{Combined, Filter};
@@ -25,8 +29,8 @@ pub(super) struct Search {
     pub threshold: f32,
 }
 
-/// The search with its working memory, above all the last three rows of determinants of every layer
-/// of an octave.
+/// The search with its working memory, above all the last three rows of determinants of every
+/// inner layer of an octave.
 #[derive(Debug, Default)]
 pub(super) struct Detector {
     columns: SortedColumns,
@@ -34,11 +38,12 @@ pub(super) struct Detector {
     candidates: Vec<usize>,
     filters: Vec<Filter>,
     samples: usize,
+    /// Row by row of each layer but the lowest and the highest.
     determinants: Vec<f32>,
 }
 
-/// The three rows around a sample in three neighbouring layers: `rows[layer][row]`.
-type Neighbourhood<'a> = [[&'a [f32]; 3]; 3];
+/// The samples around one in a layer: `values[row][column]`.
+type Layer = [[f32; 3]; 3];
 
 impl Detector {
     /// Appends the keypoints to `keypoints`, without direction and σ, octave by octave, row by row.
@@ -73,11 +78,12 @@ impl Detector {
     ) {
         self.samples = integral.width() >> octave;
         self.determinants
-            .resize(self.filters.len() * 3 * self.samples, 0.0);
+            .resize((self.filters.len() - 2) * 3 * self.samples, 0.0);
         for row in 0..integral.height() >> octave {
-            for (layer, filter) in self.filters.iter().enumerate() {
+            for layer in 1..self.filters.len() - 1 {
+                let filter = &self.filters[layer];
                 if filter.samples(integral, row) > 0 {
-                    let start = (layer * 3 + row % 3) * self.samples;
+                    let start = self.start(layer, row);
                     let out = &mut self.determinants[start..][..self.samples];
                     filter.respond(integral, &self.columns, row, &mut self.combined, out);
                 }
@@ -107,17 +113,17 @@ impl Detector {
         }
         let mut candidates = std::mem::take(&mut self.candidates);
         candidates.clear();
-        let near = self.neighbourhood(layer, centre);
+        let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
         let columns = margin..self.samples - margin;
-        find_candidates(&near[1], threshold, columns, &mut candidates);
+        find_candidates(&near, threshold, columns, &mut candidates);
         for &column in &candidates {
-            if !is_highest(&near, column) {
+            let Some(layers) = self.layers_around(integral, (layer, centre, column)) else {
                 continue;
-            }
-            if let Some(offset) = top_of_quadratic(&near, column) {
+            };
+            if let Some(offset) = top_of_quadratic(&layers) {
                 let filter = &self.filters[layer];
                 keypoints.push(Keypoint {
-                    response: near[1][1][column],
+                    response: layers[1][1][1],
                     octave: octave as i32,
                     laplacian: filter.laplacian_sign(integral, centre, column),
                     ..self.place(layer, (column, centre), offset)
@@ -127,12 +133,70 @@ impl Detector {
         self.candidates = candidates;
     }
 
-    /// The rows around row `centre` of `layer`.
-    fn neighbourhood(&self, layer: usize, centre: usize) -> Neighbourhood<'_> {
-        let row = |layer: usize, row: usize| {
-            &self.determinants[(layer * 3 + row % 3) * self.samples..][..self.samples]
-        };
-        std::array::from_fn(|l| std::array::from_fn(|r| row(layer + l - 1, centre + r - 1)))
+    /// Where row `row` of an inner layer starts among the determinants.
+    fn start(&self, layer: usize, row: usize) -> usize {
+        ((layer - 1) * 3 + row % 3) * self.samples
+    }
+
+    /// A row of an inner layer, one of the last three.
+    fn row(&self, layer: usize, row: usize) -> &[f32] {
+        &self.determinants[self.start(layer, row)..][..self.samples]
+    }
+
+    /// The samples around one that exceeds its neighbours in its own layer; `None` unless it exceeds
+    /// those in the layers beside it, too.
+    fn layers_around(
+        &self,
+        integral: &IntegralImage,
+        (layer, row, column): (usize, usize, usize),
+    ) -> Option<[Layer; 3]> {
+        let mut layers = [[[0.0; 3]; 3]; 3];
+        self.held(layer, row, column, &mut layers[1]);
+        let value = layers[1][1][1];
+        let is_held = |layer| (1..self.filters.len() - 1).contains(&layer);
+        // What costs nothing first.
+        for held in [true, false] {
+            for beside in [0, 2] {
+                let (at, values) = (layer + beside - 1, &mut layers[beside]);
+                if is_held(at) != held {
+                    continue;
+                }
+                let is_exceeded = if held {
+                    self.held(at, row, column, values);
+                    values.as_flattened().iter().all(|&other| value > other)
+                } else {
+                    self.computed_while_below(value, integral, (at, row, column), values)
+                };
+                if !is_exceeded {
+                    return None;
+                }
+            }
+        }
+        Some(layers)
+    }
+
+    /// Copies the samples around one of an inner layer.
+    fn held(&self, layer: usize, row: usize, column: usize, values: &mut Layer) {
+        for (values, row) in values.iter_mut().zip(row - 1..) {
+            values.copy_from_slice(&self.row(layer, row)[column - 1..][..3]);
+        }
+    }
+
+    /// Computes the samples around one, and says whether all are below `value`; stops at the first
+    /// that is not. The middle one, most often the highest, comes first.
+    fn computed_while_below(
+        &self,
+        value: f32,
+        integral: &IntegralImage,
+        (layer, row, column): (usize, usize, usize),
+        values: &mut Layer,
+    ) -> bool {
+        let filter = &self.filters[layer];
+        [4, 1, 3, 5, 7, 0, 2, 6, 8].into_iter().all(|n| {
+            let (y, x) = (n / 3, n % 3);
+            values[y][x] = filter.determinant(integral, row + y - 1, column + x - 1);
+            value > values[y][x]
+        })
     }
 
     /// Place and size of the keypoint `offset` samples from sample `(column, row)` of `layer`.
@@ -162,7 +226,7 @@ impl Detector {
 }
 
 widened! {
-    /// Appends every column that exceeds the threshold and its four nearest neighbours to `found`.
+    /// Appends every column that exceeds the threshold and its eight neighbours to `found`.
     fn find_candidates = find_candidates_narrow, (
         rows: &[&[f32]; 3],
         threshold: f32,
@@ -178,37 +242,30 @@ fn find_candidates_narrow(
     columns: std::ops::Range<usize>,
     found: &mut Vec<usize>,
 ) {
-    let [above, here, below] = rows;
+    let [above, here, below] = *rows;
     let mut at = columns.start;
     while at + GROUP <= columns.end {
-        let (left, v, right) = (
-            &here[at - 1..][..GROUP],
-            &here[at..][..GROUP],
-            &here[at + 1..][..GROUP],
-        );
-        let (up, down) = (&above[at..][..GROUP], &below[at..][..GROUP]);
+        let up = &above[at - 1..][..GROUP + 2];
+        let v = &here[at - 1..][..GROUP + 2];
+        let down = &below[at - 1..][..GROUP + 2];
         // No branch until a whole group is done with.
-        let mut bar = [threshold; GROUP];
-        let mut hits = 0_u32;
+        let mut is_hit = [0_u8; GROUP];
         for t in 0..GROUP {
-            bar[t] = higher(
-                higher(bar[t], higher(left[t], right[t])),
-                higher(up[t], down[t]),
-            );
-            hits |= u32::from(v[t] > bar[t]);
+            let corners = higher(higher(up[t], up[t + 2]), higher(down[t], down[t + 2]));
+            let sides = higher(higher(v[t], v[t + 2]), higher(up[t + 1], down[t + 1]));
+            is_hit[t] = u8::from(v[t + 1] > higher(threshold, higher(sides, corners)));
         }
-        if hits > 0 {
-            for t in 0..GROUP {
-                if v[t] > bar[t] {
-                    found.push(at + t);
-                }
-            }
+        let mut hits = u128::from_le_bytes(is_hit);
+        while hits != 0 {
+            found.push(at + (hits.trailing_zeros() / 8) as usize);
+            hits &= hits - 1;
         }
         at += GROUP;
     }
     for at in at..columns.end {
-        let others = [here[at - 1], here[at + 1], above[at], below[at], threshold];
-        if others.iter().all(|&other| here[at] > other) {
+        let ends = rows.iter().flat_map(|row| [row[at - 1], row[at + 1]]);
+        let bar = ends.chain([above[at], below[at]]).fold(threshold, higher);
+        if here[at] > bar {
             found.push(at);
         }
     }
@@ -220,19 +277,10 @@ fn higher(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
-/// Whether the sample exceeds its 26 neighbours.
-fn is_highest(near: &Neighbourhood, column: usize) -> bool {
-    let value = near[1][1][column];
-    near.iter().flatten().enumerate().all(|(n, row)| {
-        let [left, middle, right] = [row[column - 1], row[column], row[column + 1]];
-        value > left && value > right && (n == 4 || value > middle)
-    })
-}
-
 /// Where the quadratic through the 27 samples has its top: column, row, layer, in samples from the
 /// middle one. `None` if it has none within one sample of it.
-fn top_of_quadratic(near: &Neighbourhood, column: usize) -> Option<[f32; 3]> {
-    let v = |x: usize, y: usize, s: usize| f64::from(near[s][y][column + x - 1]);
+fn top_of_quadratic(layers: &[Layer; 3]) -> Option<[f32; 3]> {
+    let v = |x: usize, y: usize, s: usize| f64::from(layers[s][y][x]);
     let gradient = [
         0.5 * (v(2, 1, 1) - v(0, 1, 1)),
         0.5 * (v(1, 2, 1) - v(1, 0, 1)),

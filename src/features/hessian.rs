@@ -129,17 +129,59 @@ impl Filter {
         );
     }
 
+    /// The determinant at sample `(row, column)`, to the last bit what [`Self::respond`] gives.
+    pub(super) fn determinant(&self, integral: &IntegralImage, row: usize, column: usize) -> f32 {
+        let n = &self.ninth_px;
+        let rows = self.rows_at(integral, row, column);
+        let strip = |x: usize| rows[7][n[x]].wrapping_sub(rows[2][n[x]]);
+        let xx = second(strip(0), strip(3), strip(6), strip(9));
+        let yy = self.sum_yy(&rows);
+        let pillar = |x: usize| {
+            let [a, b, c, d] = [1, 4, 5, 8].map(|y| rows[y][n[x]]);
+            mixed(a, b, c, d)
+        };
+        let xy = mixed(pillar(1), pillar(4), pillar(5), pillar(8));
+        self.weighed(xx, yy, xy)
+    }
+
     /// The Laplacian's sign at sample `(row, column)`: +1 for a dark blob, −1 for a light one.
     pub(super) fn laplacian_sign(&self, integral: &IntegralImage, row: usize, column: usize) -> i8 {
         let n = &self.ninth_px;
-        let left = (column - self.margin()) * self.step_px;
-        let top = (row - self.margin()) * self.step_px;
-        let rows: [&[i32]; 10] = std::array::from_fn(|k| &integral.row(top + n[k])[left..]);
+        let rows = self.rows_at(integral, row, column);
         let strip = |x: usize| rows[7][n[x]].wrapping_sub(rows[2][n[x]]);
         let sum_xx = second(strip(0), strip(3), strip(6), strip(9));
+        (i64::from(sum_xx) + i64::from(self.sum_yy(&rows))).signum() as i8
+    }
+
+    /// The integral rows at the filter's ninths, from its left side on.
+    #[inline(always)]
+    fn rows_at<'a>(
+        &self,
+        integral: &'a IntegralImage,
+        row: usize,
+        column: usize,
+    ) -> [&'a [i32]; 10] {
+        let left = (column - self.margin()) * self.step_px;
+        let top = (row - self.margin()) * self.step_px;
+        let n = &self.ninth_px;
+        std::array::from_fn(|k| &integral.row(top + n[k])[left..][..=self.size_px])
+    }
+
+    /// D_yy times the area of its boxes.
+    #[inline(always)]
+    fn sum_yy(&self, rows: &[&[i32]; 10]) -> i32 {
+        let n = &self.ninth_px;
         let strip = |y: usize| rows[y][n[7]].wrapping_sub(rows[y][n[2]]);
-        let sum_yy = second(strip(0), strip(3), strip(6), strip(9));
-        (i64::from(sum_xx) + i64::from(sum_yy)).signum() as i8
+        second(strip(0), strip(3), strip(6), strip(9))
+    }
+
+    /// The determinant from the sums over the boxes.
+    #[inline(always)]
+    fn weighed(&self, xx: i32, yy: i32, xy: i32) -> f32 {
+        let d_xx = xx as f32 * self.per_area;
+        let d_yy = yy as f32 * self.per_area;
+        let d_xy = xy as f32 * self.per_mixed_area;
+        d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy
     }
 }
 
@@ -164,18 +206,41 @@ fn respond_narrow(
     out: &mut [f32],
 ) {
     let [xx, yy, xy] = combined;
-    difference([rows[2], rows[7]], xx);
-    second_difference([rows[0], rows[3], rows[6], rows[9]], yy);
-    mixed_difference([rows[1], rows[4], rows[5], rows[8]], xy);
+    combine(rows, xx, yy, xy);
+    weigh(filter, [xx, yy, xy], places, out);
+}
+
+/// Combines the rows with the vertical weights of D_xx, D_yy and D_xy.
+#[inline(always)]
+fn combine(rows: &[&[i32]; 10], xx: &mut [i32], yy: &mut [i32], xy: &mut [i32]) {
+    let len = xx.len();
+    let (yy, xy) = (&mut yy[..len], &mut xy[..len]);
+    let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9] = *rows;
+    let (r0, r1, r2, r3, r4) = (&r0[..len], &r1[..len], &r2[..len], &r3[..len], &r4[..len]);
+    let (r5, r6, r7, r8, r9) = (&r5[..len], &r6[..len], &r7[..len], &r8[..len], &r9[..len]);
+    for x in 0..len {
+        xx[x] = r7[x].wrapping_sub(r2[x]);
+        yy[x] = second(r0[x], r3[x], r6[x], r9[x]);
+        xy[x] = mixed(r1[x], r4[x], r5[x], r8[x]);
+    }
+}
+
+/// Determinants from the combined rows.
+#[inline(always)]
+fn weigh(filter: &Filter, combined: [&[i32]; 3], places: [usize; 10], out: &mut [f32]) {
     let len = out.len();
-    let [x0, x3, x6, x9] = [0, 3, 6, 9].map(|n| &xx[places[n]..][..len]);
-    let [y2, y7] = [2, 7].map(|n| &yy[places[n]..][..len]);
-    let [m1, m4, m5, m8] = [1, 4, 5, 8].map(|n| &xy[places[n]..][..len]);
+    let [xx, yy, xy] = combined;
+    let [p0, p1, p2, p3, p4, p5, p6, p7, p8, p9] = places;
+    let (x0, x3) = (&xx[p0..][..len], &xx[p3..][..len]);
+    let (x6, x9) = (&xx[p6..][..len], &xx[p9..][..len]);
+    let (y2, y7) = (&yy[p2..][..len], &yy[p7..][..len]);
+    let (m1, m4) = (&xy[p1..][..len], &xy[p4..][..len]);
+    let (m5, m8) = (&xy[p5..][..len], &xy[p8..][..len]);
     for j in 0..len {
-        let d_xx = second(x0[j], x3[j], x6[j], x9[j]) as f32 * filter.per_area;
-        let d_yy = y7[j].wrapping_sub(y2[j]) as f32 * filter.per_area;
-        let d_xy = mixed(m1[j], m4[j], m5[j], m8[j]) as f32 * filter.per_mixed_area;
-        out[j] = d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy;
+        let xx = second(x0[j], x3[j], x6[j], x9[j]);
+        let yy = y7[j].wrapping_sub(y2[j]);
+        let xy = mixed(m1[j], m4[j], m5[j], m8[j]);
+        out[j] = filter.weighed(xx, yy, xy);
     }
 }
 
@@ -191,30 +256,6 @@ fn second(a: i32, b: i32, c: i32, d: i32) -> i32 {
 #[inline(always)]
 fn mixed(a: i32, b: i32, c: i32, d: i32) -> i32 {
     b.wrapping_sub(a).wrapping_sub(d.wrapping_sub(c))
-}
-
-#[inline(always)]
-fn difference(from: [&[i32]; 2], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = from[1][x].wrapping_sub(from[0][x]);
-    }
-}
-
-#[inline(always)]
-fn second_difference(from: [&[i32]; 4], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = second(from[0][x], from[1][x], from[2][x], from[3][x]);
-    }
-}
-
-#[inline(always)]
-fn mixed_difference(from: [&[i32]; 4], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = mixed(from[0][x], from[1][x], from[2][x], from[3][x]);
-    }
 }
 
 #[cfg(test)]
@@ -270,6 +311,8 @@ mod tests {
                         (found - expected).abs() <= 1e-6 * scale,
                         "{found} {expected}"
                     );
+                    let single = filter.determinant(&integral, row, filter.margin() + j);
+                    assert_eq!(single.to_bits(), out[filter.margin() + j].to_bits());
                     let sign = filter.laplacian_sign(&integral, row, filter.margin() + j);
                     assert!(f64::from(sign) * (xx + yy) >= 0.0);
                 }
