@@ -57,18 +57,6 @@ impl IntegralImage {
         &self.sums[y * self.stride..][..self.stride]
     }
 
-    /// The sums at the corners of the four quarters of a square of side `2 half` with upper left
-    /// corner `(x, y)`, row by row.
-    #[inline(always)]
-    pub(super) fn quarters(&self, x: usize, y: usize, half: usize) -> [[i32; 3]; 3] {
-        let square = &self.sums[y * self.stride + x..];
-        let corners = |row: usize| {
-            let row = &square[row * half * self.stride..][..2 * half + 1];
-            [row[0], row[half], row[2 * half]]
-        };
-        [corners(0), corners(1), corners(2)]
-    }
-
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
