@@ -14,9 +14,14 @@ use super::Keypoint;
 use super::hessian::{Combined, Filter};
 use super::integral::{IntegralImage, SortedColumns};
 use super::simd::widened;
+use std::ops::Range;
+
+/// Samples across a strip of the first octave, narrow enough for what a strip needs of the integral
+/// image to stay in the nearest cache. The other octaves are narrow enough as they are.
+const STRIP: usize = 192;
 
 /// Samples that are looked at together before any of them is looked at closely.
-const GROUP: usize = 16;
+const GROUP: usize = 8;
 
 /// What is searched for.
 #[derive(Clone, Copy, Debug)]
@@ -35,6 +40,7 @@ pub(super) struct Search {
 pub(super) struct Detector {
     columns: SortedColumns,
     combined: Combined,
+    marks: Vec<u8>,
     candidates: Vec<usize>,
     filters: Vec<Filter>,
     samples: usize,
@@ -79,30 +85,57 @@ impl Detector {
         self.samples = integral.width() >> octave;
         self.determinants
             .resize((self.filters.len() - 2) * 3 * self.samples, 0.0);
+        let strip = if octave == 0 { STRIP } else { self.samples };
+        // The first sample with complete neighbours in the second layer.
+        let first = self.filters[2].margin() + 1;
+        let mut start = first;
+        while start + first < self.samples {
+            let end = (start + strip).min(self.samples - first);
+            self.detect_in_strip(integral, threshold, octave, start..end, keypoints);
+            start = end;
+        }
+    }
+
+    /// Searches the samples of some columns of all rows.
+    fn detect_in_strip(
+        &mut self,
+        integral: &IntegralImage,
+        threshold: f32,
+        octave: u32,
+        strip: Range<usize>,
+        keypoints: &mut Vec<Keypoint>,
+    ) {
+        let around = strip.start - 1..strip.end + 1;
         for row in 0..integral.height() >> octave {
             for layer in 1..self.filters.len() - 1 {
                 let filter = &self.filters[layer];
-                if filter.samples(integral, row) > 0 {
+                let margin = filter.margin();
+                let samples = margin..margin + filter.samples(integral, row);
+                let wanted = around.start.max(samples.start)..around.end.min(samples.end);
+                if !wanted.is_empty() {
                     let start = self.start(layer, row);
-                    let out = &mut self.determinants[start..][..self.samples];
-                    filter.respond(integral, &self.columns, row, &mut self.combined, out);
+                    let out = &mut self.determinants[start..][wanted.clone()];
+                    let at = (row, wanted.start);
+                    filter.respond(integral, &self.columns, at, &mut self.combined, out);
                 }
             }
             let Some(centre) = row.checked_sub(1) else {
                 continue;
             };
             for layer in 1..self.filters.len() - 1 {
-                self.search_row(integral, threshold, (octave, layer, centre), keypoints);
+                let at = (octave, layer, centre);
+                self.search_row(integral, threshold, at, &strip, keypoints);
             }
         }
     }
 
-    /// Searches row `centre` of a layer; the row below it is the last one computed.
+    /// Searches a strip of row `centre` of a layer; the row below it is the last one computed.
     fn search_row(
         &mut self,
         integral: &IntegralImage,
         threshold: f32,
         (octave, layer, centre): (u32, usize, usize),
+        strip: &Range<usize>,
         keypoints: &mut Vec<Keypoint>,
     ) {
         // All neighbours must be complete, which the layer above decides.
@@ -111,11 +144,12 @@ impl Detector {
         if centre < margin || centre + margin >= rows || 2 * margin >= self.samples {
             return;
         }
+        let columns = strip.start.max(margin)..strip.end.min(self.samples - margin);
         let mut candidates = std::mem::take(&mut self.candidates);
+        let mut marks = std::mem::take(&mut self.marks);
         candidates.clear();
         let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
-        let columns = margin..self.samples - margin;
-        find_candidates(&near, threshold, columns, &mut candidates);
+        find_candidates(&near, threshold, columns, &mut marks, &mut candidates);
         for &column in &candidates {
             let Some(layers) = self.layers_around(integral, (layer, centre, column)) else {
                 continue;
@@ -130,7 +164,7 @@ impl Detector {
                 });
             }
         }
-        self.candidates = candidates;
+        (self.candidates, self.marks) = (candidates, marks);
     }
 
     /// Where row `row` of an inner layer starts among the determinants.
@@ -155,19 +189,18 @@ impl Detector {
         let value = layers[1][1][1];
         let is_held = |layer| (1..self.filters.len() - 1).contains(&layer);
         // What costs nothing first.
-        for held in [true, false] {
-            for beside in [0, 2] {
-                let (at, values) = (layer + beside - 1, &mut layers[beside]);
-                if is_held(at) != held {
-                    continue;
+        for beside in [0, 2] {
+            if is_held(layer + beside - 1) {
+                self.held(layer + beside - 1, row, column, &mut layers[beside]);
+                if !exceeds(value, &layers[beside]) {
+                    return None;
                 }
-                let is_exceeded = if held {
-                    self.held(at, row, column, values);
-                    values.as_flattened().iter().all(|&other| value > other)
-                } else {
-                    self.computed_while_below(value, integral, (at, row, column), values)
-                };
-                if !is_exceeded {
+            }
+        }
+        for beside in [0, 2] {
+            if !is_held(layer + beside - 1) {
+                let at = (layer + beside - 1, row, column);
+                if !self.computed_while_below(value, integral, at, &mut layers[beside]) {
                     return None;
                 }
             }
@@ -177,8 +210,9 @@ impl Detector {
 
     /// Copies the samples around one of an inner layer.
     fn held(&self, layer: usize, row: usize, column: usize, values: &mut Layer) {
-        for (values, row) in values.iter_mut().zip(row - 1..) {
-            values.copy_from_slice(&self.row(layer, row)[column - 1..][..3]);
+        for n in 0..3 {
+            let start = self.start(layer, row + n - 1) + column - 1;
+            values[n].copy_from_slice(&self.determinants[start..start + 3]);
         }
     }
 
@@ -192,11 +226,15 @@ impl Detector {
         values: &mut Layer,
     ) -> bool {
         let filter = &self.filters[layer];
-        [4, 1, 3, 5, 7, 0, 2, 6, 8].into_iter().all(|n| {
+        for n in [4, 1, 3, 5, 7, 0, 2, 6, 8] {
             let (y, x) = (n / 3, n % 3);
-            values[y][x] = filter.determinant(integral, row + y - 1, column + x - 1);
-            value > values[y][x]
-        })
+            let other = filter.determinant(integral, row + y - 1, column + x - 1);
+            if value <= other {
+                return false;
+            }
+            values[y][x] = other;
+        }
+        true
     }
 
     /// Place and size of the keypoint `offset` samples from sample `(column, row)` of `layer`.
@@ -219,56 +257,64 @@ impl Detector {
     pub(super) fn capacity(&self) -> usize {
         self.columns.capacity()
             + self.combined.capacity()
+            + self.marks.capacity()
             + self.candidates.capacity()
             + self.filters.capacity()
             + self.determinants.capacity()
     }
 }
 
+/// Appends every column that exceeds the threshold and its eight neighbours to `found`; `marks` is
+/// working memory.
+fn find_candidates(
+    rows: &[&[f32]; 3],
+    threshold: f32,
+    columns: Range<usize>,
+    marks: &mut Vec<u8>,
+    found: &mut Vec<usize>,
+) {
+    let len = columns.len();
+    if marks.len() < len.next_multiple_of(GROUP) {
+        marks.resize(len.next_multiple_of(GROUP), 0);
+    }
+    let around = columns.start - 1..columns.end + 1;
+    let rows = [0, 1, 2].map(|n| &rows[n][around.clone()]);
+    mark_highest(rows, threshold, &mut marks[..len]);
+    marks[len..].fill(0);
+    for (group, marks) in marks.as_chunks::<GROUP>().0.iter().enumerate() {
+        let mut marked = u64::from_le_bytes(*marks);
+        while marked != 0 {
+            found.push(columns.start + group * GROUP + marked.trailing_zeros() as usize / 8);
+            marked &= marked - 1;
+        }
+    }
+}
+
 widened! {
-    /// Appends every column that exceeds the threshold and its eight neighbours to `found`.
-    fn find_candidates = find_candidates_narrow, (
-        rows: &[&[f32]; 3],
-        threshold: f32,
-        columns: std::ops::Range<usize>,
-        found: &mut Vec<usize>,
-    )
+    /// Marks with 1 what exceeds the threshold and its eight neighbours, with 0 what does not.
+    fn mark_highest = mark_highest_narrow, (rows: [&[f32]; 3], threshold: f32, marks: &mut [u8])
 }
 
 #[inline(always)]
-fn find_candidates_narrow(
-    rows: &[&[f32]; 3],
-    threshold: f32,
-    columns: std::ops::Range<usize>,
-    found: &mut Vec<usize>,
-) {
-    let [above, here, below] = *rows;
-    let mut at = columns.start;
-    while at + GROUP <= columns.end {
-        let up = &above[at - 1..][..GROUP + 2];
-        let v = &here[at - 1..][..GROUP + 2];
-        let down = &below[at - 1..][..GROUP + 2];
-        // No branch until a whole group is done with.
-        let mut is_hit = [0_u8; GROUP];
-        for t in 0..GROUP {
-            let corners = higher(higher(up[t], up[t + 2]), higher(down[t], down[t + 2]));
-            let sides = higher(higher(v[t], v[t + 2]), higher(up[t + 1], down[t + 1]));
-            is_hit[t] = u8::from(v[t + 1] > higher(threshold, higher(sides, corners)));
-        }
-        let mut hits = u128::from_le_bytes(is_hit);
-        while hits != 0 {
-            found.push(at + (hits.trailing_zeros() / 8) as usize);
-            hits &= hits - 1;
-        }
-        at += GROUP;
+fn mark_highest_narrow(rows: [&[f32]; 3], threshold: f32, marks: &mut [u8]) {
+    let [above, here, below] = rows;
+    let len = marks.len();
+    let (up_left, up, up_right) = (&above[..len], &above[1..][..len], &above[2..][..len]);
+    let (left, value, right) = (&here[..len], &here[1..][..len], &here[2..][..len]);
+    let (down_left, down, down_right) = (&below[..len], &below[1..][..len], &below[2..][..len]);
+    for x in 0..len {
+        let sides = higher(higher(left[x], right[x]), higher(up[x], down[x]));
+        let upper = higher(up_left[x], up_right[x]);
+        let lower = higher(down_left[x], down_right[x]);
+        let bar = higher(higher(threshold, sides), higher(upper, lower));
+        marks[x] = u8::from(value[x] > bar);
     }
-    for at in at..columns.end {
-        let ends = rows.iter().flat_map(|row| [row[at - 1], row[at + 1]]);
-        let bar = ends.chain([above[at], below[at]]).fold(threshold, higher);
-        if here[at] > bar {
-            found.push(at);
-        }
-    }
+}
+
+/// Whether `value` exceeds all samples of a layer.
+#[inline(always)]
+fn exceeds(value: f32, layer: &Layer) -> bool {
+    layer.as_flattened().iter().all(|&other| value > other)
 }
 
 /// The higher of two determinants, none of which is ever NaN.

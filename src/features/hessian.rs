@@ -50,7 +50,9 @@ pub(super) struct Combined([Vec<i32>; 3]);
 impl Combined {
     /// Makes room for rows of `len` sums.
     fn reserve(&mut self, len: usize) {
-        self.0.iter_mut().for_each(|row| row.resize(len, 0));
+        for row in self.0.iter_mut().filter(|row| row.len() < len) {
+            row.resize(len, 0);
+        }
     }
 
     /// Elements held.
@@ -105,74 +107,64 @@ impl Filter {
         }
     }
 
-    /// The determinants of row `row`, which has [`Self::samples`], to the samples of `out` from
-    /// [`Self::margin`] on. The columns are sorted by this filter's step.
+    /// The determinants of samples of a row, from sample `(row, column)` on; all are among the
+    /// row's [`Self::samples`]. The columns are sorted by this filter's step.
     pub(super) fn respond(
         &self,
         integral: &IntegralImage,
         columns: &SortedColumns,
-        row: usize,
+        (row, column): (usize, usize),
         combined: &mut Combined,
         out: &mut [f32],
     ) {
         debug_assert_eq!(columns.step(), self.step_px);
-        let out = &mut out[self.margin()..][..self.samples(integral, row)];
         let top = (row - self.margin()) * self.step_px;
-        let rows = self.ninth_px.map(|y| columns.row(integral, top + y));
+        let left = (column - self.margin()) * self.step_px;
+        let mut rows = [[].as_slice(); 10];
+        let mut places = [0; 10];
+        for (n, &ninth_px) in self.ninth_px.iter().enumerate() {
+            rows[n] = columns.row(integral, top + ninth_px);
+            places[n] = columns.place(left + ninth_px);
+        }
+        if self.step_px == 1 {
+            // Nothing beyond the filters around the samples.
+            places = self.ninth_px;
+            for row in &mut rows {
+                *row = &row[left..][..out.len() + self.size_px];
+            }
+        }
         combined.reserve(rows[0].len());
-        respond(
-            self,
-            &rows,
-            self.ninth_px.map(|x| columns.place(x)),
-            &mut combined.0,
-            out,
-        );
+        respond(self, &rows, places, &mut combined.0, out);
     }
 
     /// The determinant at sample `(row, column)`, to the last bit what [`Self::respond`] gives.
     pub(super) fn determinant(&self, integral: &IntegralImage, row: usize, column: usize) -> f32 {
-        let n = &self.ninth_px;
-        let rows = self.rows_at(integral, row, column);
-        let strip = |x: usize| rows[7][n[x]].wrapping_sub(rows[2][n[x]]);
-        let xx = second(strip(0), strip(3), strip(6), strip(9));
-        let yy = self.sum_yy(&rows);
-        let pillar = |x: usize| {
-            let [a, b, c, d] = [1, 4, 5, 8].map(|y| rows[y][n[x]]);
-            mixed(a, b, c, d)
-        };
+        let corners = self.corners(row, column);
+        let at = |y: usize, x: usize| integral.at(corners[0][y], corners[1][x]);
+        let [xx, yy] = second_sums(&at);
+        let pillar = |x: usize| mixed(at(1, x), at(4, x), at(5, x), at(8, x));
         let xy = mixed(pillar(1), pillar(4), pillar(5), pillar(8));
         self.weighed(xx, yy, xy)
     }
 
     /// The Laplacian's sign at sample `(row, column)`: +1 for a dark blob, −1 for a light one.
     pub(super) fn laplacian_sign(&self, integral: &IntegralImage, row: usize, column: usize) -> i8 {
-        let n = &self.ninth_px;
-        let rows = self.rows_at(integral, row, column);
-        let strip = |x: usize| rows[7][n[x]].wrapping_sub(rows[2][n[x]]);
-        let sum_xx = second(strip(0), strip(3), strip(6), strip(9));
-        (i64::from(sum_xx) + i64::from(self.sum_yy(&rows))).signum() as i8
+        let corners = self.corners(row, column);
+        let [xx, yy] = second_sums(&|y: usize, x: usize| integral.at(corners[0][y], corners[1][x]));
+        (i64::from(xx) + i64::from(yy)).signum() as i8
     }
 
-    /// The integral rows at the filter's ninths, from its left side on.
+    /// The rows and the columns at the filter's ninths around a sample.
     #[inline(always)]
-    fn rows_at<'a>(
-        &self,
-        integral: &'a IntegralImage,
-        row: usize,
-        column: usize,
-    ) -> [&'a [i32]; 10] {
-        let left = (column - self.margin()) * self.step_px;
+    fn corners(&self, row: usize, column: usize) -> [[usize; 10]; 2] {
         let top = (row - self.margin()) * self.step_px;
-        let n = &self.ninth_px;
-        std::array::from_fn(|k| &integral.row(top + n[k])[left..][..=self.size_px])
-    }
-
-    /// D_yy times the area of its boxes.
-    #[inline(always)]
-    fn sum_yy(&self, rows: &[&[i32]; 10]) -> i32 {
-        let n = &self.ninth_px;
-        let strip = |y: usize| rows[y][n[7]].wrapping_sub(rows[y][n[2]]);
-        second(strip(0), strip(3), strip(6), strip(9))
+        let left = (column - self.margin()) * self.step_px;
+        let mut corners = [[0; 10]; 2];
+        for n in 0..10 {
+            corners[0][n] = top + self.ninth_px[n];
+            corners[1][n] = left + self.ninth_px[n];
+        }
+        corners
     }
 
     /// The determinant from the sums over the boxes.
@@ -205,8 +197,9 @@ fn respond_narrow(
     combined: &mut [Vec<i32>; 3],
     out: &mut [f32],
 ) {
+    let len = rows[0].len();
     let [xx, yy, xy] = combined;
-    combine(rows, xx, yy, xy);
+    combine(rows, &mut xx[..len], &mut yy[..len], &mut xy[..len]);
     weigh(filter, [xx, yy, xy], places, out);
 }
 
@@ -242,6 +235,18 @@ fn weigh(filter: &Filter, combined: [&[i32]; 3], places: [usize; 10], out: &mut 
         let xy = mixed(m1[j], m4[j], m5[j], m8[j]);
         out[j] = filter.weighed(xx, yy, xy);
     }
+}
+
+/// D_xx and D_yy times the area of their boxes, from the integral image at a row's and a column's
+/// ninth of a filter.
+#[inline(always)]
+fn second_sums(at: &impl Fn(usize, usize) -> i32) -> [i32; 2] {
+    let xx = |x: usize| at(7, x).wrapping_sub(at(2, x));
+    let yy = |y: usize| at(y, 7).wrapping_sub(at(y, 2));
+    [
+        second(xx(0), xx(3), xx(6), xx(9)),
+        second(yy(0), yy(3), yy(6), yy(9)),
+    ]
 }
 
 /// Weights 1, −2, 1 on the three stretches between four cumulated values.
@@ -296,7 +301,8 @@ mod tests {
                 let samples = filter.samples(&integral, row);
                 let mut out = vec![f32::NAN; 131];
                 if samples > 0 {
-                    filter.respond(&integral, &columns, row, &mut combined, &mut out);
+                    let out = &mut out[filter.margin()..][..samples];
+                    filter.respond(&integral, &columns, (row, filter.margin()), &mut combined, out);
                 }
                 for j in (0..samples).step_by(3) {
                     let top = (row - filter.margin()) * filter.step_px;
@@ -363,9 +369,9 @@ mod tests {
         filter.respond(
             &integral,
             &columns,
-            3500,
+            (3500, filter.margin()),
             &mut Combined::default(),
-            &mut out,
+            &mut out[filter.margin()..5000 - filter.margin()],
         );
         assert!(out[4500] > 1000.0);
         assert!(out[10..4400].iter().all(|&v| v == 0.0));

@@ -57,6 +57,12 @@ impl IntegralImage {
         &self.sums[y * self.stride..][..self.stride]
     }
 
+    /// The sum at corner `(y, x)`.
+    #[inline(always)]
+    pub(super) fn at(&self, y: usize, x: usize) -> i32 {
+        self.sums[y * self.stride + x]
+    }
+
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {

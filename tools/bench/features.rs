@@ -14,7 +14,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 960;
-const RUNS: usize = 60;
+const RUNS: usize = 100;
 
 fn main() {
     let image = scene();
