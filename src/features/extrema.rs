@@ -149,7 +149,12 @@ impl Detector {
         let mut marks = std::mem::take(&mut self.marks);
         candidates.clear();
         let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
-        find_candidates(&near, threshold, columns, &mut marks, &mut candidates);
+        let beside = [layer - 1, layer + 1].map(|beside| {
+            let is_held = self.is_held(beside);
+            is_held.then(|| self.row(beside, centre)).unwrap_or(near[0])
+        });
+        let rows = [near[0], near[1], near[2], beside[0], beside[1]];
+        find_candidates(&rows, threshold, columns, &mut marks, &mut candidates);
         for &column in &candidates {
             let Some(layers) = self.layers_around(integral, (layer, centre, column)) else {
                 continue;
@@ -165,6 +170,11 @@ impl Detector {
             }
         }
         (self.candidates, self.marks) = (candidates, marks);
+    }
+
+    /// Whether a layer is an inner one.
+    fn is_held(&self, layer: usize) -> bool {
+        0 < layer && layer + 1 < self.filters.len()
     }
 
     /// Where row `row` of an inner layer starts among the determinants.
@@ -187,10 +197,9 @@ impl Detector {
         let mut layers = [[[0.0; 3]; 3]; 3];
         self.held(layer, row, column, &mut layers[1]);
         let value = layers[1][1][1];
-        let is_held = |layer| (1..self.filters.len() - 1).contains(&layer);
         // What costs nothing first.
         for beside in [0, 2] {
-            if is_held(layer + beside - 1) {
+            if self.is_held(layer + beside - 1) {
                 self.held(layer + beside - 1, row, column, &mut layers[beside]);
                 if !exceeds(value, &layers[beside]) {
                     return None;
@@ -198,7 +207,7 @@ impl Detector {
             }
         }
         for beside in [0, 2] {
-            if !is_held(layer + beside - 1) {
+            if !self.is_held(layer + beside - 1) {
                 let at = (layer + beside - 1, row, column);
                 if !self.computed_while_below(value, integral, at, &mut layers[beside]) {
                     return None;
@@ -264,10 +273,10 @@ impl Detector {
     }
 }
 
-/// Appends every column that exceeds the threshold and its eight neighbours to `found`; `marks` is
-/// working memory.
+/// Appends every column of the middle of three rows that exceeds the threshold, its eight
+/// neighbours and the two rows of other layers that follow to `found`; `marks` is working memory.
 fn find_candidates(
-    rows: &[&[f32]; 3],
+    rows: &[&[f32]; 5],
     threshold: f32,
     columns: Range<usize>,
     marks: &mut Vec<u8>,
@@ -278,7 +287,7 @@ fn find_candidates(
         marks.resize(len.next_multiple_of(GROUP), 0);
     }
     let around = columns.start - 1..columns.end + 1;
-    let rows = [0, 1, 2].map(|n| &rows[n][around.clone()]);
+    let rows = [0, 1, 2, 3, 4].map(|n| &rows[n][around.clone()]);
     mark_highest(rows, threshold, &mut marks[..len]);
     marks[len..].fill(0);
     for (group, marks) in marks.as_chunks::<GROUP>().0.iter().enumerate() {
@@ -291,14 +300,16 @@ fn find_candidates(
 }
 
 widened! {
-    /// Marks with 1 what exceeds the threshold and its eight neighbours, with 0 what does not.
-    fn mark_highest = mark_highest_narrow, (rows: [&[f32]; 3], threshold: f32, marks: &mut [u8])
+    /// Marks with 1 what [`find_candidates`] is after, with 0 what it is not; the rows begin one
+    /// column before.
+    fn mark_highest = mark_highest_narrow, (rows: [&[f32]; 5], threshold: f32, marks: &mut [u8])
 }
 
 #[inline(always)]
-fn mark_highest_narrow(rows: [&[f32]; 3], threshold: f32, marks: &mut [u8]) {
-    let [above, here, below] = rows;
+fn mark_highest_narrow(rows: [&[f32]; 5], threshold: f32, marks: &mut [u8]) {
+    let [above, here, below, finer, coarser] = rows;
     let len = marks.len();
+    let (finer, coarser) = (&finer[1..][..len], &coarser[1..][..len]);
     let (up_left, up, up_right) = (&above[..len], &above[1..][..len], &above[2..][..len]);
     let (left, value, right) = (&here[..len], &here[1..][..len], &here[2..][..len]);
     let (down_left, down, down_right) = (&below[..len], &below[1..][..len], &below[2..][..len]);
@@ -306,7 +317,8 @@ fn mark_highest_narrow(rows: [&[f32]; 3], threshold: f32, marks: &mut [u8]) {
         let sides = higher(higher(left[x], right[x]), higher(up[x], down[x]));
         let upper = higher(up_left[x], up_right[x]);
         let lower = higher(down_left[x], down_right[x]);
-        let bar = higher(higher(threshold, sides), higher(upper, lower));
+        let layers = higher(higher(finer[x], coarser[x]), threshold);
+        let bar = higher(higher(layers, sides), higher(upper, lower));
         marks[x] = u8::from(value[x] > bar);
     }
 }

@@ -134,7 +134,9 @@ impl SortedColumns {
     /// Where column `x` stands in a row; the columns `x + step`, `x + 2 step`, … follow it.
     #[inline]
     pub(super) fn place(&self, x: usize) -> usize {
-        x % self.step * (self.row_len / self.step) + x / self.step
+        // The step is a power of two.
+        let bits = self.step.trailing_zeros();
+        (x & (self.step - 1)) * (self.row_len >> bits) + (x >> bits)
     }
 
     /// Elements held.
