@@ -302,7 +302,13 @@ mod tests {
                 let mut out = vec![f32::NAN; 131];
                 if samples > 0 {
                     let out = &mut out[filter.margin()..][..samples];
-                    filter.respond(&integral, &columns, (row, filter.margin()), &mut combined, out);
+                    filter.respond(
+                        &integral,
+                        &columns,
+                        (row, filter.margin()),
+                        &mut combined,
+                        out,
+                    );
                 }
                 for j in (0..samples).step_by(3) {
                     let top = (row - filter.margin()) * filter.step_px;

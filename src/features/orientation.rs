@@ -238,7 +238,11 @@ fn strongest_sector_narrow(gradients: &Gradients, sum: &mut [f32; 2]) {
         squares[n] = xs[n] * xs[n] + ys[n] * ys[n];
     }
     for n in 0..SECTORS {
-        longest = if squares[n] > longest { squares[n] } else { longest };
+        longest = if squares[n] > longest {
+            squares[n]
+        } else {
+            longest
+        };
     }
     for n in 0..SECTORS {
         if squares[n] == longest {
@@ -325,7 +329,10 @@ mod tests {
     fn the_disc_has_as_many_points_as_said() {
         let compass = Compass::new();
         let rows = compass.rows.iter();
-        let weights: Vec<f32> = rows.flat_map(|r| &r.weights[r.first..r.end]).copied().collect();
+        let weights: Vec<f32> = rows
+            .flat_map(|r| &r.weights[r.first..r.end])
+            .copied()
+            .collect();
         assert_eq!(weights.len(), POINTS);
         assert!(weights.iter().all(|&w| w > 0.0));
         assert_eq!(weights.iter().filter(|&&w| w == 1.0).count(), 1);

@@ -42,7 +42,11 @@ impl Pyramid {
             }
             let (done, rest) = self.halved.split_at_mut(self.built);
             // The image itself is level 0; the first of the halved ones stays empty.
-            let last = if self.built < 2 { image } else { &done[self.built - 1] };
+            let last = if self.built < 2 {
+                image
+            } else {
+                &done[self.built - 1]
+            };
             let this = if self.built == 0 {
                 image
             } else {
@@ -82,7 +86,9 @@ impl Level {
         self.pitch = image.width() as usize + 2 * BORDER_PX;
         let rows = image.height() as usize + 2 * BORDER_PX;
         self.pairs.resize(self.pitch * rows, 0);
-        let row = |y: usize| image.row(y.saturating_sub(BORDER_PX).min(image.height() as usize - 1) as u32);
+        let row = |y: usize| {
+            image.row(y.saturating_sub(BORDER_PX).min(image.height() as usize - 1) as u32)
+        };
         for (y, pairs) in self.pairs.chunks_exact_mut(self.pitch).enumerate() {
             let (left, inside) = pairs.split_at_mut(BORDER_PX);
             let (inside, right) = inside.split_at_mut(image.width() as usize);
@@ -163,7 +169,10 @@ mod tests {
         let mut pyramid = Pyramid::default();
         assert_eq!(pixels(pyramid.level(&image, 1), 2, 2), [3, 5, 8, 9]);
         assert_eq!(pixels(pyramid.level(&image, 2), 1, 1), [6]);
-        assert_eq!(pixels(pyramid.level(&image, 0), 3, 3), [1, 2, 3, 4, 5, 6, 7, 8, 9]);
+        assert_eq!(
+            pixels(pyramid.level(&image, 0), 3, 3),
+            [1, 2, 3, 4, 5, 6, 7, 8, 9]
+        );
         let other = GrayImage::filled(4, 2, 7);
         pyramid.clear();
         assert_eq!(pixels(pyramid.level(&other, 1), 2, 1), [7, 7]);
@@ -175,8 +184,10 @@ mod tests {
         let mut pyramid = Pyramid::default();
         let level = pyramid.level(&image, 0);
         let border = BORDER_PX as i32;
-        for (y, x) in (-border..2 + border).flat_map(|y| (-border..2 + border).map(move |x| (y, x))) {
-            let nearest = |x: i32, y: i32| u16::from(image.row(y.clamp(0, 1) as u32)[x.clamp(0, 1) as usize]);
+        for (y, x) in (-border..2 + border).flat_map(|y| (-border..2 + border).map(move |x| (y, x)))
+        {
+            let nearest =
+                |x: i32, y: i32| u16::from(image.row(y.clamp(0, 1) as u32)[x.clamp(0, 1) as usize]);
             let pair = level.from(x, y)[0];
             assert_eq!((pair % 256, pair / 256), (nearest(x, y), nearest(x, y + 1)));
         }

@@ -1,6 +1,7 @@
 //! Pipeline: the method itself, and the threads that carry pairs through it.
 
 mod driver;
+mod histogram;
 mod method;
 mod statistics;
 
