@@ -25,6 +25,7 @@ pub mod matching;
 pub mod output;
 pub mod pipeline;
 pub mod settings;
+mod simd;
 pub mod simulation;
 mod toml_file;
 pub mod uncertainty;

@@ -5,6 +5,7 @@
 
 #[path = "../tools/bench/common/memory.rs"]
 #[cfg(test)]
+#[expect(dead_code, reason = "the benches read recordings, too")]
 mod memory;
 
 #[cfg(test)]

@@ -14,8 +14,8 @@
 use super::Keypoint;
 use super::orientation::Direction;
 use super::patch::{CELLS, Cells, Patch};
-use super::simd::widened;
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// Gradients across the patch.
 const GRADIENTS: usize = CELLS - 1;

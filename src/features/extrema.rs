@@ -13,7 +13,7 @@
 use super::Keypoint;
 use super::hessian::{Combined, Filter};
 use super::integral::{IntegralImage, SortedColumns};
-use super::simd::widened;
+use crate::simd::widened;
 use std::ops::Range;
 
 /// Samples across a strip of the first octave, narrow enough for what a strip needs of the integral

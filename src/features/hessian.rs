@@ -20,7 +20,7 @@
 //! multiplications all is in integers, so no order of summation can change a bit.
 
 use super::integral::{IntegralImage, SortedColumns};
-use super::simd::widened;
+use crate::simd::widened;
 
 /// How much the mixed derivative counts: the boxes' norm ratio of Bay et al., equation 4, squared.
 const MIXED_WEIGHT: f32 = 0.81;

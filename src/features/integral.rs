@@ -1,7 +1,7 @@
 //! The integral image: a grey image in, sums over any upright rectangle in four look-ups out.
 
-use super::simd::widened;
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// Sums of all pixels above and to the left of each pixel corner.
 ///

@@ -10,7 +10,7 @@
 )]
 
 use super::integral::IntegralImage;
-use super::simd::{round_i32, widened};
+use crate::simd::{round_i32, widened};
 
 /// Radius of the disc in which gradients are taken, in units of the scale.
 const RADIUS: i32 = 6;

@@ -11,8 +11,8 @@
 use super::Keypoint;
 use super::orientation::Direction;
 use super::pyramid::{Level, Pyramid};
-use super::simd::{round_i32, widened};
 use crate::image::GrayImage;
+use crate::simd::{round_i32, widened};
 
 /// Cells across the patch.
 pub(super) const CELLS: usize = 21;
@@ -173,11 +173,13 @@ fn add_row(
         right[b] = (x & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
         low[b] = (y & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
     }
+    // Of equal length, so that one look at a place does for both.
+    let last = pixels.pairs.len() - 1;
+    let (pairs, next) = (&pixels.pairs[..last], &pixels.pairs[1..][..last]);
     let mut quads = [0_u32; SAMPLES_PADDED];
     for b in 0..SAMPLES {
         let place = places[b] as usize;
-        let [pair, next] = [pixels.pairs[place], pixels.pairs[place + 1]];
-        quads[b] = u32::from(pair) | u32::from(next) << 16;
+        quads[b] = u32::from(pairs[place]) | u32::from(next[place]) << 16;
     }
     for b in 0..SAMPLES_PADDED {
         let pixel = |byte: u32| ((quads[b] >> (8 * byte)) & 0xff) as i32 as f32;

@@ -2,8 +2,8 @@
 //!
 //! Large keypoints are described from a smaller image, so that none costs more than another.
 
-use super::simd::widened;
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// How far beyond the image's border a level can be sampled, px.
 pub(super) const BORDER_PX: usize = 48;

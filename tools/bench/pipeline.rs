@@ -20,7 +20,7 @@ use visod::pipeline::{self, Delivery, Method, StageLatencies};
 use visod::simulation::{small_rig, thesis_rig};
 
 /// Pairs of one measurement.
-const PAIRS: u64 = 200;
+const PAIRS: u64 = 100;
 /// Pairs before that, which grow the buffers.
 const WARM_UP: u64 = 20;
 /// Different pairs of a simulated recording.
