@@ -29,6 +29,7 @@ pub mod output;
 pub mod pipeline;
 pub mod refinement;
 pub mod settings;
+mod simd;
 pub mod simulation;
 mod toml_file;
 pub mod uncertainty;

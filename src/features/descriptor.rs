@@ -6,11 +6,16 @@
 //! gradients, or, extended, each of these sums apart for both signs of the other derivative (Bay et
 //! al., section 4.2).
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::Keypoint;
 use super::orientation::Direction;
 use super::patch::{CELLS, Cells, Patch};
-use super::simd::widened;
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// Gradients across the patch.
 const GRADIENTS: usize = CELLS - 1;
@@ -123,8 +128,7 @@ fn sum_parts<const TERMS: usize>(
     terms: impl Fn(f32, f32) -> [f32; TERMS],
     out: &mut [f32],
 ) {
-    let bands = out.chunks_exact_mut(PARTS * TERMS);
-    for (band, out) in bands.enumerate() {
+    for band in 0..PARTS {
         let mut columns = [[0.0_f32; GRADIENTS]; TERMS];
         for y in band * PART..(band + 1) * PART {
             let (above, below, weights) = (&cells[y], &cells[y + 1], &weights[y]);
@@ -139,9 +143,15 @@ fn sum_parts<const TERMS: usize>(
                 }
             }
         }
-        for (part, out) in out.chunks_exact_mut(TERMS).enumerate() {
-            for (out, columns) in out.iter_mut().zip(&columns) {
-                *out = columns[part * PART..][..PART].iter().sum();
+        let out = &mut out[band * PARTS * TERMS..][..PARTS * TERMS];
+        for part in 0..PARTS {
+            for n in 0..TERMS {
+                let column = &columns[n][part * PART..][..PART];
+                let mut sum = column[0];
+                for x in 1..PART {
+                    sum += column[x];
+                }
+                out[part * TERMS + n] = sum;
             }
         }
     }

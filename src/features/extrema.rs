@@ -4,15 +4,24 @@
 //! determinant is above the threshold and above all 26 neighbours in row, column and layer; a
 //! quadratic through these 27 then gives place and size between the samples (Brown and Lowe,
 //! *Invariant Features from Interest Point Groups*, 2002), and a candidate whose top lies more than
-//! one sample away is none. Only three rows of each layer are ever held.
+//! one sample away is none.
+//!
+//! The lowest and the highest layer of an octave hold no keypoints, so they are computed where a
+//! sample of the layer beside them is the highest so far, and nowhere else. Of the other layers
+//! only three rows are ever held.
 
 use super::Keypoint;
 use super::hessian::{Combined, Filter};
 use super::integral::{IntegralImage, SortedColumns};
-use super::simd::widened;
+use crate::simd::widened;
+use std::ops::Range;
+
+/// Samples across a strip of the first octave, narrow enough for what a strip needs of the integral
+/// image to stay in the nearest cache. The other octaves are narrow enough as they are.
+const STRIP: usize = 192;
 
 /// Samples that are looked at together before any of them is looked at closely.
-const GROUP: usize = 16;
+const GROUP: usize = 8;
 
 /// What is searched for.
 #[derive(Clone, Copy, Debug)]
@@ -25,20 +34,22 @@ pub(super) struct Search {
     pub threshold: f32,
 }
 
-/// The search with its working memory, above all the last three rows of determinants of every layer
-/// of an octave.
+/// The search with its working memory, above all the last three rows of determinants of every
+/// inner layer of an octave.
 #[derive(Debug, Default)]
 pub(super) struct Detector {
     columns: SortedColumns,
     combined: Combined,
+    marks: Vec<u8>,
     candidates: Vec<usize>,
     filters: Vec<Filter>,
     samples: usize,
+    /// Row by row of each layer but the lowest and the highest.
     determinants: Vec<f32>,
 }
 
-/// The three rows around a sample in three neighbouring layers: `rows[layer][row]`.
-type Neighbourhood<'a> = [[&'a [f32]; 3]; 3];
+/// The samples around one in a layer: `values[row][column]`.
+type Layer = [[f32; 3]; 3];
 
 impl Detector {
     /// Appends the keypoints to `keypoints`, without direction and σ, octave by octave, row by row.
@@ -73,30 +84,58 @@ impl Detector {
     ) {
         self.samples = integral.width() >> octave;
         self.determinants
-            .resize(self.filters.len() * 3 * self.samples, 0.0);
+            .resize((self.filters.len() - 2) * 3 * self.samples, 0.0);
+        let strip = if octave == 0 { STRIP } else { self.samples };
+        // The first sample with complete neighbours in the second layer.
+        let first = self.filters[2].margin() + 1;
+        let mut start = first;
+        while start + first < self.samples {
+            let end = (start + strip).min(self.samples - first);
+            self.detect_in_strip(integral, threshold, octave, start..end, keypoints);
+            start = end;
+        }
+    }
+
+    /// Searches the samples of some columns of all rows.
+    fn detect_in_strip(
+        &mut self,
+        integral: &IntegralImage,
+        threshold: f32,
+        octave: u32,
+        strip: Range<usize>,
+        keypoints: &mut Vec<Keypoint>,
+    ) {
+        let around = strip.start - 1..strip.end + 1;
         for row in 0..integral.height() >> octave {
-            for (layer, filter) in self.filters.iter().enumerate() {
-                if filter.samples(integral, row) > 0 {
-                    let start = (layer * 3 + row % 3) * self.samples;
-                    let out = &mut self.determinants[start..][..self.samples];
-                    filter.respond(integral, &self.columns, row, &mut self.combined, out);
+            for layer in 1..self.filters.len() - 1 {
+                let filter = &self.filters[layer];
+                let margin = filter.margin();
+                let samples = margin..margin + filter.samples(integral, row);
+                let wanted = around.start.max(samples.start)..around.end.min(samples.end);
+                if !wanted.is_empty() {
+                    let start = self.start(layer, row);
+                    let out = &mut self.determinants[start..][wanted.clone()];
+                    let at = (row, wanted.start);
+                    filter.respond(integral, &self.columns, at, &mut self.combined, out);
                 }
             }
             let Some(centre) = row.checked_sub(1) else {
                 continue;
             };
             for layer in 1..self.filters.len() - 1 {
-                self.search_row(integral, threshold, (octave, layer, centre), keypoints);
+                let at = (octave, layer, centre);
+                self.search_row(integral, threshold, at, &strip, keypoints);
             }
         }
     }
 
-    /// Searches row `centre` of a layer; the row below it is the last one computed.
+    /// Searches a strip of row `centre` of a layer; the row below it is the last one computed.
     fn search_row(
         &mut self,
         integral: &IntegralImage,
         threshold: f32,
         (octave, layer, centre): (u32, usize, usize),
+        strip: &Range<usize>,
         keypoints: &mut Vec<Keypoint>,
     ) {
         // All neighbours must be complete, which the layer above decides.
@@ -105,34 +144,106 @@ impl Detector {
         if centre < margin || centre + margin >= rows || 2 * margin >= self.samples {
             return;
         }
+        let columns = strip.start.max(margin)..strip.end.min(self.samples - margin);
         let mut candidates = std::mem::take(&mut self.candidates);
+        let mut marks = std::mem::take(&mut self.marks);
         candidates.clear();
-        let near = self.neighbourhood(layer, centre);
-        let columns = margin..self.samples - margin;
-        find_candidates(&near[1], threshold, columns, &mut candidates);
+        let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
+        let beside = [layer - 1, layer + 1].map(|beside| {
+            let is_held = self.is_held(beside);
+            is_held.then(|| self.row(beside, centre)).unwrap_or(near[0])
+        });
+        let rows = [near[0], near[1], near[2], beside[0], beside[1]];
+        find_candidates(&rows, threshold, columns, &mut marks, &mut candidates);
         for &column in &candidates {
-            if !is_highest(&near, column) {
+            let Some(layers) = self.layers_around(integral, (layer, centre, column)) else {
                 continue;
-            }
-            if let Some(offset) = top_of_quadratic(&near, column) {
+            };
+            if let Some(offset) = top_of_quadratic(&layers) {
                 let filter = &self.filters[layer];
                 keypoints.push(Keypoint {
-                    response: near[1][1][column],
+                    response: layers[1][1][1],
                     octave: octave as i32,
                     laplacian: filter.laplacian_sign(integral, centre, column),
                     ..self.place(layer, (column, centre), offset)
                 });
             }
         }
-        self.candidates = candidates;
+        (self.candidates, self.marks) = (candidates, marks);
     }
 
-    /// The rows around row `centre` of `layer`.
-    fn neighbourhood(&self, layer: usize, centre: usize) -> Neighbourhood<'_> {
-        let row = |layer: usize, row: usize| {
-            &self.determinants[(layer * 3 + row % 3) * self.samples..][..self.samples]
-        };
-        std::array::from_fn(|l| std::array::from_fn(|r| row(layer + l - 1, centre + r - 1)))
+    /// Whether a layer is an inner one.
+    fn is_held(&self, layer: usize) -> bool {
+        0 < layer && layer + 1 < self.filters.len()
+    }
+
+    /// Where row `row` of an inner layer starts among the determinants.
+    fn start(&self, layer: usize, row: usize) -> usize {
+        ((layer - 1) * 3 + row % 3) * self.samples
+    }
+
+    /// A row of an inner layer, one of the last three.
+    fn row(&self, layer: usize, row: usize) -> &[f32] {
+        &self.determinants[self.start(layer, row)..][..self.samples]
+    }
+
+    /// The samples around one that exceeds its neighbours in its own layer; `None` unless it exceeds
+    /// those in the layers beside it, too.
+    fn layers_around(
+        &self,
+        integral: &IntegralImage,
+        (layer, row, column): (usize, usize, usize),
+    ) -> Option<[Layer; 3]> {
+        let mut layers = [[[0.0; 3]; 3]; 3];
+        self.held(layer, row, column, &mut layers[1]);
+        let value = layers[1][1][1];
+        // What costs nothing first.
+        for beside in [0, 2] {
+            if self.is_held(layer + beside - 1) {
+                self.held(layer + beside - 1, row, column, &mut layers[beside]);
+                if !exceeds(value, &layers[beside]) {
+                    return None;
+                }
+            }
+        }
+        for beside in [0, 2] {
+            if !self.is_held(layer + beside - 1) {
+                let at = (layer + beside - 1, row, column);
+                if !self.computed_while_below(value, integral, at, &mut layers[beside]) {
+                    return None;
+                }
+            }
+        }
+        Some(layers)
+    }
+
+    /// Copies the samples around one of an inner layer.
+    fn held(&self, layer: usize, row: usize, column: usize, values: &mut Layer) {
+        for n in 0..3 {
+            let start = self.start(layer, row + n - 1) + column - 1;
+            values[n].copy_from_slice(&self.determinants[start..start + 3]);
+        }
+    }
+
+    /// Computes the samples around one, and says whether all are below `value`; stops at the first
+    /// that is not. The middle one, most often the highest, comes first.
+    fn computed_while_below(
+        &self,
+        value: f32,
+        integral: &IntegralImage,
+        (layer, row, column): (usize, usize, usize),
+        values: &mut Layer,
+    ) -> bool {
+        let filter = &self.filters[layer];
+        for n in [4, 1, 3, 5, 7, 0, 2, 6, 8] {
+            let (y, x) = (n / 3, n % 3);
+            let other = filter.determinant(integral, row + y - 1, column + x - 1);
+            if value <= other {
+                return false;
+            }
+            values[y][x] = other;
+        }
+        true
     }
 
     /// Place and size of the keypoint `offset` samples from sample `(column, row)` of `layer`.
@@ -155,63 +266,67 @@ impl Detector {
     pub(super) fn capacity(&self) -> usize {
         self.columns.capacity()
             + self.combined.capacity()
+            + self.marks.capacity()
             + self.candidates.capacity()
             + self.filters.capacity()
             + self.determinants.capacity()
     }
 }
 
+/// Appends every column of the middle of three rows that exceeds the threshold, its eight
+/// neighbours and the two rows of other layers that follow to `found`; `marks` is working memory.
+fn find_candidates(
+    rows: &[&[f32]; 5],
+    threshold: f32,
+    columns: Range<usize>,
+    marks: &mut Vec<u8>,
+    found: &mut Vec<usize>,
+) {
+    let len = columns.len();
+    if marks.len() < len.next_multiple_of(GROUP) {
+        marks.resize(len.next_multiple_of(GROUP), 0);
+    }
+    let around = columns.start - 1..columns.end + 1;
+    let rows = [0, 1, 2, 3, 4].map(|n| &rows[n][around.clone()]);
+    mark_highest(rows, threshold, &mut marks[..len]);
+    marks[len..].fill(0);
+    for (group, marks) in marks.as_chunks::<GROUP>().0.iter().enumerate() {
+        let mut marked = u64::from_le_bytes(*marks);
+        while marked != 0 {
+            found.push(columns.start + group * GROUP + marked.trailing_zeros() as usize / 8);
+            marked &= marked - 1;
+        }
+    }
+}
+
 widened! {
-    /// Appends every column that exceeds the threshold and its four nearest neighbours to `found`.
-    fn find_candidates = find_candidates_narrow, (
-        rows: &[&[f32]; 3],
-        threshold: f32,
-        columns: std::ops::Range<usize>,
-        found: &mut Vec<usize>,
-    )
+    /// Marks with 1 what [`find_candidates`] is after, with 0 what it is not; the rows begin one
+    /// column before.
+    fn mark_highest = mark_highest_narrow, (rows: [&[f32]; 5], threshold: f32, marks: &mut [u8])
 }
 
 #[inline(always)]
-fn find_candidates_narrow(
-    rows: &[&[f32]; 3],
-    threshold: f32,
-    columns: std::ops::Range<usize>,
-    found: &mut Vec<usize>,
-) {
-    let [above, here, below] = rows;
-    let mut at = columns.start;
-    while at + GROUP <= columns.end {
-        let (left, v, right) = (
-            &here[at - 1..][..GROUP],
-            &here[at..][..GROUP],
-            &here[at + 1..][..GROUP],
-        );
-        let (up, down) = (&above[at..][..GROUP], &below[at..][..GROUP]);
-        // No branch until a whole group is done with.
-        let mut bar = [threshold; GROUP];
-        let mut hits = 0_u32;
-        for t in 0..GROUP {
-            bar[t] = higher(
-                higher(bar[t], higher(left[t], right[t])),
-                higher(up[t], down[t]),
-            );
-            hits |= u32::from(v[t] > bar[t]);
-        }
-        if hits > 0 {
-            for t in 0..GROUP {
-                if v[t] > bar[t] {
-                    found.push(at + t);
-                }
-            }
-        }
-        at += GROUP;
+fn mark_highest_narrow(rows: [&[f32]; 5], threshold: f32, marks: &mut [u8]) {
+    let [above, here, below, finer, coarser] = rows;
+    let len = marks.len();
+    let (finer, coarser) = (&finer[1..][..len], &coarser[1..][..len]);
+    let (up_left, up, up_right) = (&above[..len], &above[1..][..len], &above[2..][..len]);
+    let (left, value, right) = (&here[..len], &here[1..][..len], &here[2..][..len]);
+    let (down_left, down, down_right) = (&below[..len], &below[1..][..len], &below[2..][..len]);
+    for x in 0..len {
+        let sides = higher(higher(left[x], right[x]), higher(up[x], down[x]));
+        let upper = higher(up_left[x], up_right[x]);
+        let lower = higher(down_left[x], down_right[x]);
+        let layers = higher(higher(finer[x], coarser[x]), threshold);
+        let bar = higher(higher(layers, sides), higher(upper, lower));
+        marks[x] = u8::from(value[x] > bar);
     }
-    for at in at..columns.end {
-        let others = [here[at - 1], here[at + 1], above[at], below[at], threshold];
-        if others.iter().all(|&other| here[at] > other) {
-            found.push(at);
-        }
-    }
+}
+
+/// Whether `value` exceeds all samples of a layer.
+#[inline(always)]
+fn exceeds(value: f32, layer: &Layer) -> bool {
+    layer.as_flattened().iter().all(|&other| value > other)
 }
 
 /// The higher of two determinants, none of which is ever NaN.
@@ -220,19 +335,10 @@ fn higher(a: f32, b: f32) -> f32 {
     if a > b { a } else { b }
 }
 
-/// Whether the sample exceeds its 26 neighbours.
-fn is_highest(near: &Neighbourhood, column: usize) -> bool {
-    let value = near[1][1][column];
-    near.iter().flatten().enumerate().all(|(n, row)| {
-        let [left, middle, right] = [row[column - 1], row[column], row[column + 1]];
-        value > left && value > right && (n == 4 || value > middle)
-    })
-}
-
 /// Where the quadratic through the 27 samples has its top: column, row, layer, in samples from the
 /// middle one. `None` if it has none within one sample of it.
-fn top_of_quadratic(near: &Neighbourhood, column: usize) -> Option<[f32; 3]> {
-    let v = |x: usize, y: usize, s: usize| f64::from(near[s][y][column + x - 1]);
+fn top_of_quadratic(layers: &[Layer; 3]) -> Option<[f32; 3]> {
+    let v = |x: usize, y: usize, s: usize| f64::from(layers[s][y][x]);
     let gradient = [
         0.5 * (v(2, 1, 1) - v(0, 1, 1)),
         0.5 * (v(1, 2, 1) - v(1, 0, 1)),

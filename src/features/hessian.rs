@@ -20,7 +20,7 @@
 //! multiplications all is in integers, so no order of summation can change a bit.
 
 use super::integral::{IntegralImage, SortedColumns};
-use super::simd::widened;
+use crate::simd::widened;
 
 /// How much the mixed derivative counts: the boxes' norm ratio of Bay et al., equation 4, squared.
 const MIXED_WEIGHT: f32 = 0.81;
@@ -50,7 +50,9 @@ pub(super) struct Combined([Vec<i32>; 3]);
 impl Combined {
     /// Makes room for rows of `len` sums.
     fn reserve(&mut self, len: usize) {
-        self.0.iter_mut().for_each(|row| row.resize(len, 0));
+        for row in self.0.iter_mut().filter(|row| row.len() < len) {
+            row.resize(len, 0);
+        }
     }
 
     /// Elements held.
@@ -105,41 +107,73 @@ impl Filter {
         }
     }
 
-    /// The determinants of row `row`, which has [`Self::samples`], to the samples of `out` from
-    /// [`Self::margin`] on. The columns are sorted by this filter's step.
+    /// The determinants of samples of a row, from sample `(row, column)` on; all are among the
+    /// row's [`Self::samples`]. The columns are sorted by this filter's step.
     pub(super) fn respond(
         &self,
         integral: &IntegralImage,
         columns: &SortedColumns,
-        row: usize,
+        (row, column): (usize, usize),
         combined: &mut Combined,
         out: &mut [f32],
     ) {
         debug_assert_eq!(columns.step(), self.step_px);
-        let out = &mut out[self.margin()..][..self.samples(integral, row)];
         let top = (row - self.margin()) * self.step_px;
-        let rows = self.ninth_px.map(|y| columns.row(integral, top + y));
+        let left = (column - self.margin()) * self.step_px;
+        let mut rows = [[].as_slice(); 10];
+        let mut places = [0; 10];
+        for (n, &ninth_px) in self.ninth_px.iter().enumerate() {
+            rows[n] = columns.row(integral, top + ninth_px);
+            places[n] = columns.place(left + ninth_px);
+        }
+        if self.step_px == 1 {
+            // Nothing beyond the filters around the samples.
+            places = self.ninth_px;
+            for row in &mut rows {
+                *row = &row[left..][..out.len() + self.size_px];
+            }
+        }
         combined.reserve(rows[0].len());
-        respond(
-            self,
-            &rows,
-            self.ninth_px.map(|x| columns.place(x)),
-            &mut combined.0,
-            out,
-        );
+        respond(self, &rows, places, &mut combined.0, out);
+    }
+
+    /// The determinant at sample `(row, column)`, to the last bit what [`Self::respond`] gives.
+    pub(super) fn determinant(&self, integral: &IntegralImage, row: usize, column: usize) -> f32 {
+        let corners = self.corners(row, column);
+        let at = |y: usize, x: usize| integral.at(corners[0][y], corners[1][x]);
+        let [xx, yy] = second_sums(&at);
+        let pillar = |x: usize| mixed(at(1, x), at(4, x), at(5, x), at(8, x));
+        let xy = mixed(pillar(1), pillar(4), pillar(5), pillar(8));
+        self.weighed(xx, yy, xy)
     }
 
     /// The Laplacian's sign at sample `(row, column)`: +1 for a dark blob, −1 for a light one.
     pub(super) fn laplacian_sign(&self, integral: &IntegralImage, row: usize, column: usize) -> i8 {
-        let n = &self.ninth_px;
-        let left = (column - self.margin()) * self.step_px;
+        let corners = self.corners(row, column);
+        let [xx, yy] = second_sums(&|y: usize, x: usize| integral.at(corners[0][y], corners[1][x]));
+        (i64::from(xx) + i64::from(yy)).signum() as i8
+    }
+
+    /// The rows and the columns at the filter's ninths around a sample.
+    #[inline(always)]
+    fn corners(&self, row: usize, column: usize) -> [[usize; 10]; 2] {
         let top = (row - self.margin()) * self.step_px;
-        let rows: [&[i32]; 10] = std::array::from_fn(|k| &integral.row(top + n[k])[left..]);
-        let strip = |x: usize| rows[7][n[x]].wrapping_sub(rows[2][n[x]]);
-        let sum_xx = second(strip(0), strip(3), strip(6), strip(9));
-        let strip = |y: usize| rows[y][n[7]].wrapping_sub(rows[y][n[2]]);
-        let sum_yy = second(strip(0), strip(3), strip(6), strip(9));
-        (i64::from(sum_xx) + i64::from(sum_yy)).signum() as i8
+        let left = (column - self.margin()) * self.step_px;
+        let mut corners = [[0; 10]; 2];
+        for n in 0..10 {
+            corners[0][n] = top + self.ninth_px[n];
+            corners[1][n] = left + self.ninth_px[n];
+        }
+        corners
+    }
+
+    /// The determinant from the sums over the boxes.
+    #[inline(always)]
+    fn weighed(&self, xx: i32, yy: i32, xy: i32) -> f32 {
+        let d_xx = xx as f32 * self.per_area;
+        let d_yy = yy as f32 * self.per_area;
+        let d_xy = xy as f32 * self.per_mixed_area;
+        d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy
     }
 }
 
@@ -163,20 +197,56 @@ fn respond_narrow(
     combined: &mut [Vec<i32>; 3],
     out: &mut [f32],
 ) {
+    let len = rows[0].len();
     let [xx, yy, xy] = combined;
-    difference([rows[2], rows[7]], xx);
-    second_difference([rows[0], rows[3], rows[6], rows[9]], yy);
-    mixed_difference([rows[1], rows[4], rows[5], rows[8]], xy);
-    let len = out.len();
-    let [x0, x3, x6, x9] = [0, 3, 6, 9].map(|n| &xx[places[n]..][..len]);
-    let [y2, y7] = [2, 7].map(|n| &yy[places[n]..][..len]);
-    let [m1, m4, m5, m8] = [1, 4, 5, 8].map(|n| &xy[places[n]..][..len]);
-    for j in 0..len {
-        let d_xx = second(x0[j], x3[j], x6[j], x9[j]) as f32 * filter.per_area;
-        let d_yy = y7[j].wrapping_sub(y2[j]) as f32 * filter.per_area;
-        let d_xy = mixed(m1[j], m4[j], m5[j], m8[j]) as f32 * filter.per_mixed_area;
-        out[j] = d_xx * d_yy - MIXED_WEIGHT * d_xy * d_xy;
+    combine(rows, &mut xx[..len], &mut yy[..len], &mut xy[..len]);
+    weigh(filter, [xx, yy, xy], places, out);
+}
+
+/// Combines the rows with the vertical weights of D_xx, D_yy and D_xy.
+#[inline(always)]
+fn combine(rows: &[&[i32]; 10], xx: &mut [i32], yy: &mut [i32], xy: &mut [i32]) {
+    let len = xx.len();
+    let (yy, xy) = (&mut yy[..len], &mut xy[..len]);
+    let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9] = *rows;
+    let (r0, r1, r2, r3, r4) = (&r0[..len], &r1[..len], &r2[..len], &r3[..len], &r4[..len]);
+    let (r5, r6, r7, r8, r9) = (&r5[..len], &r6[..len], &r7[..len], &r8[..len], &r9[..len]);
+    for x in 0..len {
+        xx[x] = r7[x].wrapping_sub(r2[x]);
+        yy[x] = second(r0[x], r3[x], r6[x], r9[x]);
+        xy[x] = mixed(r1[x], r4[x], r5[x], r8[x]);
     }
+}
+
+/// Determinants from the combined rows.
+#[inline(always)]
+fn weigh(filter: &Filter, combined: [&[i32]; 3], places: [usize; 10], out: &mut [f32]) {
+    let len = out.len();
+    let [xx, yy, xy] = combined;
+    let [p0, p1, p2, p3, p4, p5, p6, p7, p8, p9] = places;
+    let (x0, x3) = (&xx[p0..][..len], &xx[p3..][..len]);
+    let (x6, x9) = (&xx[p6..][..len], &xx[p9..][..len]);
+    let (y2, y7) = (&yy[p2..][..len], &yy[p7..][..len]);
+    let (m1, m4) = (&xy[p1..][..len], &xy[p4..][..len]);
+    let (m5, m8) = (&xy[p5..][..len], &xy[p8..][..len]);
+    for j in 0..len {
+        let xx = second(x0[j], x3[j], x6[j], x9[j]);
+        let yy = y7[j].wrapping_sub(y2[j]);
+        let xy = mixed(m1[j], m4[j], m5[j], m8[j]);
+        out[j] = filter.weighed(xx, yy, xy);
+    }
+}
+
+/// D_xx and D_yy times the area of their boxes, from the integral image at a row's and a column's
+/// ninth of a filter.
+#[inline(always)]
+fn second_sums(at: &impl Fn(usize, usize) -> i32) -> [i32; 2] {
+    let xx = |x: usize| at(7, x).wrapping_sub(at(2, x));
+    let yy = |y: usize| at(y, 7).wrapping_sub(at(y, 2));
+    [
+        second(xx(0), xx(3), xx(6), xx(9)),
+        second(yy(0), yy(3), yy(6), yy(9)),
+    ]
 }
 
 /// Weights 1, −2, 1 on the three stretches between four cumulated values.
@@ -191,30 +261,6 @@ fn second(a: i32, b: i32, c: i32, d: i32) -> i32 {
 #[inline(always)]
 fn mixed(a: i32, b: i32, c: i32, d: i32) -> i32 {
     b.wrapping_sub(a).wrapping_sub(d.wrapping_sub(c))
-}
-
-#[inline(always)]
-fn difference(from: [&[i32]; 2], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = from[1][x].wrapping_sub(from[0][x]);
-    }
-}
-
-#[inline(always)]
-fn second_difference(from: [&[i32]; 4], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = second(from[0][x], from[1][x], from[2][x], from[3][x]);
-    }
-}
-
-#[inline(always)]
-fn mixed_difference(from: [&[i32]; 4], to: &mut [i32]) {
-    let from = from.map(|row| &row[..to.len()]);
-    for x in 0..to.len() {
-        to[x] = mixed(from[0][x], from[1][x], from[2][x], from[3][x]);
-    }
 }
 
 #[cfg(test)]
@@ -255,7 +301,14 @@ mod tests {
                 let samples = filter.samples(&integral, row);
                 let mut out = vec![f32::NAN; 131];
                 if samples > 0 {
-                    filter.respond(&integral, &columns, row, &mut combined, &mut out);
+                    let out = &mut out[filter.margin()..][..samples];
+                    filter.respond(
+                        &integral,
+                        &columns,
+                        (row, filter.margin()),
+                        &mut combined,
+                        out,
+                    );
                 }
                 for j in (0..samples).step_by(3) {
                     let top = (row - filter.margin()) * filter.step_px;
@@ -270,6 +323,8 @@ mod tests {
                         (found - expected).abs() <= 1e-6 * scale,
                         "{found} {expected}"
                     );
+                    let single = filter.determinant(&integral, row, filter.margin() + j);
+                    assert_eq!(single.to_bits(), out[filter.margin() + j].to_bits());
                     let sign = filter.laplacian_sign(&integral, row, filter.margin() + j);
                     assert!(f64::from(sign) * (xx + yy) >= 0.0);
                 }
@@ -320,9 +375,9 @@ mod tests {
         filter.respond(
             &integral,
             &columns,
-            3500,
+            (3500, filter.margin()),
             &mut Combined::default(),
-            &mut out,
+            &mut out[filter.margin()..5000 - filter.margin()],
         );
         assert!(out[4500] > 1000.0);
         assert!(out[10..4400].iter().all(|&v| v == 0.0));

@@ -1,6 +1,7 @@
 //! The integral image: a grey image in, sums over any upright rectangle in four look-ups out.
 
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// Sums of all pixels above and to the left of each pixel corner.
 ///
@@ -56,16 +57,10 @@ impl IntegralImage {
         &self.sums[y * self.stride..][..self.stride]
     }
 
-    /// The sums at the corners of the four quarters of a square of side `2 half` with upper left
-    /// corner `(x, y)`, row by row.
+    /// The sum at corner `(y, x)`.
     #[inline(always)]
-    pub(super) fn quarters(&self, x: usize, y: usize, half: usize) -> [[i32; 3]; 3] {
-        let square = &self.sums[y * self.stride + x..];
-        let corners = |row: usize| {
-            let row = &square[row * half * self.stride..][..2 * half + 1];
-            [row[0], row[half], row[2 * half]]
-        };
-        [corners(0), corners(1), corners(2)]
+    pub(super) fn at(&self, y: usize, x: usize) -> i32 {
+        self.sums[y * self.stride + x]
     }
 
     /// Elements held.
@@ -96,25 +91,25 @@ impl SortedColumns {
 
     /// Doubles the step.
     pub(super) fn double_step(&mut self, integral: &IntegralImage) {
-        let run = self.row_len / self.step;
+        let half = self.row_len / 2;
         self.sums.resize(self.row_len * (integral.height() + 1), 0);
         for (y, sums) in self.sums.chunks_exact_mut(self.row_len).enumerate() {
+            let (even, odd) = sums.split_at_mut(half);
             if self.step == 1 {
-                let (columns, padding) = self.row.split_at_mut(integral.stride);
-                columns.copy_from_slice(integral.row(y));
-                padding.fill(0);
-            } else {
-                self.row.copy_from_slice(sums);
+                deal(integral.row(y), even, odd);
+                continue;
             }
-            let (even, odd) = sums.split_at_mut(self.row_len / 2);
-            let runs = self.row.chunks_exact(run);
-            let halves = even
-                .chunks_exact_mut(run / 2)
-                .zip(odd.chunks_exact_mut(run / 2));
-            for (run, (even, odd)) in runs.zip(halves) {
-                for ((pair, even), odd) in run.as_chunks::<2>().0.iter().zip(even).zip(odd) {
-                    [*even, *odd] = *pair;
-                }
+            let row = &mut self.row[..self.row_len];
+            row[..half].copy_from_slice(even);
+            row[half..].copy_from_slice(odd);
+            let run = self.row_len / self.step;
+            for n in 0..self.step {
+                let [from, to] = [n * run, (n + 1) * run];
+                deal(
+                    &row[from..to],
+                    &mut even[from / 2..to / 2],
+                    &mut odd[from / 2..to / 2],
+                );
             }
         }
         self.step *= 2;
@@ -139,13 +134,33 @@ impl SortedColumns {
     /// Where column `x` stands in a row; the columns `x + step`, `x + 2 step`, … follow it.
     #[inline]
     pub(super) fn place(&self, x: usize) -> usize {
-        x % self.step * (self.row_len / self.step) + x / self.step
+        // The step is a power of two.
+        let bits = self.step.trailing_zeros();
+        (x & (self.step - 1)) * (self.row_len >> bits) + (x >> bits)
     }
 
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
         self.sums.capacity() + self.row.capacity()
+    }
+}
+
+widened! {
+    /// Deals a row out in turn: its first, third, … value to `even`, the others to `odd`.
+    fn deal = deal_narrow, (row: &[i32], even: &mut [i32], odd: &mut [i32])
+}
+
+#[inline(always)]
+fn deal_narrow(row: &[i32], even: &mut [i32], odd: &mut [i32]) {
+    let (pairs, last) = row.as_chunks::<2>();
+    let (even_pairs, odd_pairs) = (&mut even[..pairs.len()], &mut odd[..pairs.len()]);
+    for n in 0..pairs.len() {
+        even_pairs[n] = pairs[n][0];
+        odd_pairs[n] = pairs[n][1];
+    }
+    if let &[last] = last {
+        even[pairs.len()] = last;
     }
 }
 

@@ -12,7 +12,6 @@ pub mod opencv;
 mod orientation;
 mod patch;
 mod pyramid;
-mod simd;
 mod spread;
 pub mod surf;
 

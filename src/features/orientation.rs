@@ -10,12 +10,14 @@
 )]
 
 use super::integral::IntegralImage;
-use super::simd::{round_i32, widened};
+use crate::simd::{round_i32, widened};
 
 /// Radius of the disc in which gradients are taken, in units of the scale.
 const RADIUS: i32 = 6;
 /// σ of the gradients' weights, in units of the scale.
 const WEIGHT_SIGMA: f64 = 2.5;
+/// Grid points across the disc.
+const DIAMETER: usize = 2 * RADIUS as usize + 1;
 /// Grid points in the disc.
 const POINTS: usize = 113;
 /// [`POINTS`] rounded up to full vector registers.
@@ -66,23 +68,41 @@ impl Direction {
     }
 }
 
-/// Grid points and weights.
+/// Where the gradients are taken, and how much they count.
 #[derive(Debug)]
 pub(super) struct Compass {
-    points: [(f32, f32, f32); POINTS],
+    /// Row by row of the grid.
+    rows: [GridRow; DIAMETER],
+}
+
+/// The grid points of a row: from column `first` on, as many as there are weights above zero.
+#[derive(Clone, Copy, Debug, Default)]
+struct GridRow {
+    first: usize,
+    end: usize,
+    /// By column of the grid.
+    weights: [f32; DIAMETER],
+    /// By column of the grid: which gradient it is, column by column of the disc.
+    numbers: [usize; DIAMETER],
 }
 
 impl Compass {
     pub(super) fn new() -> Self {
+        let mut rows = [GridRow::default(); DIAMETER];
+        rows.iter_mut().for_each(|row| row.first = DIAMETER);
         let disc = (-RADIUS..=RADIUS)
             .flat_map(|x| (-RADIUS..=RADIUS).map(move |y| (x, y)))
             .filter(|(x, y)| x * x + y * y <= RADIUS * RADIUS);
-        let mut points = [(0.0, 0.0, 0.0); POINTS];
-        for (point, (x, y)) in points.iter_mut().zip(disc) {
+        for (number, (x, y)) in disc.enumerate() {
             let weight = (-0.5 * f64::from(x * x + y * y) / WEIGHT_SIGMA.powi(2)).exp();
-            *point = (x as f32, y as f32, weight as f32);
+            let column = (x + RADIUS) as usize;
+            let row = &mut rows[(y + RADIUS) as usize];
+            row.first = row.first.min(column);
+            row.end = row.end.max(column + 1);
+            row.weights[column] = weight as f32;
+            row.numbers[column] = number;
         }
-        Self { points }
+        Self { rows }
     }
 
     /// The direction at `(x_px, y_px)` for scale `scale_px`; `None` where no gradient can be taken
@@ -98,32 +118,44 @@ impl Compass {
         if side > integral.width() || side > integral.height() {
             return None;
         }
-        let last = [integral.width() - side, integral.height() - side].map(|n| n as i32);
-        let to_corner = (side as f32 - 1.0) * 0.5;
-        let mut corners = [[0_i32; POINTS]; 2];
-        for n in 0..POINTS {
-            let (dx, dy, _) = self.points[n];
-            corners[0][n] = round_i32(x_px + dx * scale_px - to_corner);
-            corners[1][n] = round_i32(y_px + dy * scale_px - to_corner);
-        }
+        let [xs, ys] = [x_px, y_px].map(|middle_px| corners(middle_px, scale_px, side));
+        // What cannot be taken stays zero, which adds nothing to any sum.
         let mut gradients = Gradients::default();
-        let mut len = 0;
-        for n in 0..POINTS {
-            let [x, y] = [corners[0][n], corners[1][n]];
-            if x < 0 || y < 0 || x >= last[0] || y >= last[1] {
+        let mut is_any = false;
+        for (row, y) in self.rows.iter().zip(ys) {
+            if y < 0 || y >= (integral.height() - side) as i32 {
                 continue;
             }
-            let (gx, gy) = gradient(integral, x as usize, y as usize, half);
-            gradients.x[len] = gx as f32 * self.points[n].2;
-            gradients.y[len] = gy as f32 * self.points[n].2;
-            len += 1;
+            let rows = [0, half, side].map(|below| integral.row(y as usize + below));
+            for column in row.first..row.end {
+                let x = xs[column];
+                if x < 0 || x >= (integral.width() - side) as i32 {
+                    continue;
+                }
+                let (gx, gy) = gradient(rows, x as usize, half);
+                let number = row.numbers[column];
+                gradients.x[number] = gx as f32 * row.weights[column];
+                gradients.y[number] = gy as f32 * row.weights[column];
+                is_any = true;
+            }
         }
-        (len > 0).then(|| {
+        is_any.then(|| {
             let mut sum = [0.0; 2];
             strongest_sector(&gradients, &mut sum);
             Direction::of(sum[0], sum[1])
         })
     }
+}
+
+/// One coordinate of the upper left corners of squares of side `side` around the grid's points.
+fn corners(middle_px: f32, scale_px: f32, side: usize) -> [i32; DIAMETER] {
+    let to_corner = (side as f32 - 1.0) * 0.5;
+    let mut corners = [0; DIAMETER];
+    for n in 0..DIAMETER {
+        let steps = (n as i32 - RADIUS) as f32;
+        corners[n] = round_i32(middle_px + steps * scale_px - to_corner);
+    }
+    corners
 }
 
 /// Weighted gradients; those behind the last are zero, which adds nothing to any sum.
@@ -141,20 +173,18 @@ impl Default for Gradients {
     }
 }
 
-/// Sum of the right less that of the left half of a square of side `2 half` with upper left corner
-/// `(x, y)`, and the same of its lower and upper half.
+/// Sum of the right less that of the left half of a square of side `2 half` whose corners lie from
+/// column `x` on, and the same of its lower and upper half. The integral rows are those at its
+/// upper side, its middle and its lower side.
 #[inline(always)]
-fn gradient(integral: &IntegralImage, x: usize, y: usize, half: usize) -> (i32, i32) {
-    let [top, middle, bottom] = integral.quarters(x, y, half);
-    let sum = |above: [i32; 3], below: [i32; 3], end: usize| {
-        (below[end].wrapping_sub(below[0])).wrapping_sub(above[end].wrapping_sub(above[0]))
-    };
+fn gradient([top, middle, bottom]: [&[i32]; 3], x: usize, half: usize) -> (i32, i32) {
+    let to = |row: &[i32], end: usize| row[end].wrapping_sub(row[x]);
+    let (end, centre) = (x + 2 * half, x + half);
+    let above = to(top, end);
+    let all = to(bottom, end).wrapping_sub(above);
+    let left = to(bottom, centre).wrapping_sub(to(top, centre));
+    let upper = to(middle, end).wrapping_sub(above);
     let twice = |part: i32| part.wrapping_add(part);
-    let (all, left, upper) = (
-        sum(top, bottom, 2),
-        sum(top, bottom, 1),
-        sum(top, middle, 2),
-    );
     (
         all.wrapping_sub(twice(left)),
         all.wrapping_sub(twice(upper)),
@@ -168,25 +198,30 @@ widened! {
 
 #[inline(always)]
 fn strongest_sector_narrow(gradients: &Gradients, sum: &mut [f32; 2]) {
-    let mut degrees = [0; POINTS_PADDED];
+    let mut steps = [0; POINTS_PADDED];
+    // What of each gradient is not in the first degree of its step.
+    let (mut open_x, mut open_y) = ([0.0; POINTS_PADDED], [0.0; POINTS_PADDED]);
     for n in 0..POINTS_PADDED {
-        let angle_rad = angle_rad(gradients.x[n], gradients.y[n]);
-        degrees[n] = round_i32(angle_rad * const { 180.0 / std::f32::consts::PI });
+        let (x, y) = (gradients.x[n], gradients.y[n]);
+        let angle_rad = angle_rad(x, y);
+        let degree = round_i32(angle_rad * const { 180.0 / std::f32::consts::PI }) as u32;
+        let degree = if degree >= 360 { degree - 360 } else { degree };
+        let step = degree / SECTOR_STEP_DEG as u32;
+        steps[n] = step;
+        let is_first = step * SECTOR_STEP_DEG as u32 == degree;
+        open_x[n] = if is_first { 0.0 } else { x };
+        open_y[n] = if is_first { 0.0 } else { y };
     }
     // Gradients by step of directions: all of it, and all but its first degree.
     let mut whole = [[0.0_f32; SECTORS + 2 * WHOLE_STEPS + 1]; 2];
     let mut open = [[0.0_f32; SECTORS]; 2];
-    for n in 0..POINTS_PADDED {
-        let (x, y) = (gradients.x[n], gradients.y[n]);
-        let degree = degrees[n] as usize % 360;
-        let step = degree / SECTOR_STEP_DEG;
+    for n in 0..POINTS {
+        let step = steps[n] as usize;
         let at = step + WHOLE_STEPS + 1;
-        whole[0][at] += x;
-        whole[1][at] += y;
-        if !degree.is_multiple_of(SECTOR_STEP_DEG) {
-            open[0][step] += x;
-            open[1][step] += y;
-        }
+        whole[0][at] += gradients.x[n];
+        whole[1][at] += gradients.y[n];
+        open[0][step] += open_x[n];
+        open[1][step] += open_y[n];
     }
     for wrapped in &mut whole {
         wrapped.copy_within(SECTORS..SECTORS + WHOLE_STEPS + 1, 0);
@@ -195,16 +230,24 @@ fn strongest_sector_narrow(gradients: &Gradients, sum: &mut [f32; 2]) {
             SECTORS + WHOLE_STEPS + 1,
         );
     }
-    let (xs, ys) = (
-        sector_sums(&whole[0], &open[0]),
-        sector_sums(&whole[1], &open[1]),
-    );
-    let mut longest = 0.0;
-    for (&x, &y) in xs.iter().zip(&ys) {
-        let square = x * x + y * y;
-        if square > longest {
-            longest = square;
-            *sum = [x, y];
+    let xs = sector_sums(&whole[0], &open[0]);
+    let ys = sector_sums(&whole[1], &open[1]);
+    let mut squares = [0.0_f32; SECTORS];
+    let mut longest = 0.0_f32;
+    for n in 0..SECTORS {
+        squares[n] = xs[n] * xs[n] + ys[n] * ys[n];
+    }
+    for n in 0..SECTORS {
+        longest = if squares[n] > longest {
+            squares[n]
+        } else {
+            longest
+        };
+    }
+    for n in 0..SECTORS {
+        if squares[n] == longest {
+            *sum = [xs[n], ys[n]];
+            return;
         }
     }
 }
@@ -285,8 +328,14 @@ mod tests {
     #[test]
     fn the_disc_has_as_many_points_as_said() {
         let compass = Compass::new();
-        assert!(compass.points.iter().all(|p| p.2 > 0.0));
-        assert_eq!(compass.points.iter().filter(|p| p.2 == 1.0).count(), 1);
+        let rows = compass.rows.iter();
+        let weights: Vec<f32> = rows
+            .flat_map(|r| &r.weights[r.first..r.end])
+            .copied()
+            .collect();
+        assert_eq!(weights.len(), POINTS);
+        assert!(weights.iter().all(|&w| w > 0.0));
+        assert_eq!(weights.iter().filter(|&&w| w == 1.0).count(), 1);
     }
 
     #[test]

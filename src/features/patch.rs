@@ -10,9 +10,9 @@
 
 use super::Keypoint;
 use super::orientation::Direction;
-use super::pyramid::Pyramid;
-use super::simd::{round_i32, widened};
+use super::pyramid::{Level, Pyramid};
 use crate::image::GrayImage;
+use crate::simd::{round_i32, widened};
 
 /// Cells across the patch.
 pub(super) const CELLS: usize = 21;
@@ -24,16 +24,15 @@ const SAMPLES: usize = CELLS * SAMPLES_PER_CELL;
 const SAMPLES_PADDED: usize = SAMPLES.next_multiple_of(8);
 /// Largest side of a cell in pixels of the level it is sampled from.
 const CELL_MAX_PX: f32 = 2.5;
-/// Row length of the window, px: a power of two above 21 · 2.5 · √2 + 4.
-const PITCH: usize = 128;
-/// The last index at which a sample may lie, all of whose bits are set.
-const LAST: usize = PITCH * PITCH - 1;
 /// Bits of a sample's place behind the point.
 const FRACTION_BITS: i32 = 15;
 
-/// A piece of a level. Each pixel has the one below it in its upper byte, so that the four pixels
-/// around a sample are two neighbours.
-type Window = [u16; LAST + 2];
+/// A piece of a level: what lies to the right of and below one of its pixels.
+struct Window<'a> {
+    level: &'a Level,
+    left: i32,
+    top: i32,
+}
 
 /// The means of the cells, times the samples in one.
 pub(super) type Cells = [[f32; CELLS]; CELLS];
@@ -42,7 +41,6 @@ pub(super) type Cells = [[f32; CELLS]; CELLS];
 #[derive(Debug)]
 pub(super) struct Patch {
     pyramid: Pyramid,
-    window: Box<Window>,
     cells: Cells,
 }
 
@@ -50,7 +48,6 @@ impl Patch {
     pub(super) fn new() -> Self {
         Self {
             pyramid: Pyramid::default(),
-            window: Box::new([0; LAST + 2]),
             cells: [[0.0; CELLS]; CELLS],
         }
     }
@@ -82,18 +79,14 @@ impl Patch {
         let reach_px = (0.5 * cells * cell_px * extent).ceil() as i32 + 1;
         let left = x_px.floor() as i32 - reach_px;
         let top = y_px.floor() as i32 - reach_px;
-        let side = 2 * reach_px as usize + 2;
-        let image = self.pyramid.level(image, level);
-        copy_window(image, [left, top], side, &mut self.window);
+        let window = Window {
+            level: self.pyramid.level(image, level),
+            left,
+            top,
+        };
         let centre_px = [x_px - left as f32, y_px - top as f32];
         let spacing_px = cell_px / SAMPLES_PER_CELL as f32;
-        sample(
-            &self.window,
-            centre_px,
-            spacing_px,
-            direction,
-            &mut self.cells,
-        );
+        sample(&window, centre_px, spacing_px, direction, &mut self.cells);
         &self.cells
     }
 
@@ -102,52 +95,6 @@ impl Patch {
     pub(super) fn capacity(&self) -> usize {
         self.pyramid.capacity()
     }
-}
-
-widened! {
-    /// Copies the square of `side` px, or somewhat more, with the given upper left corner to
-    /// `window`; what lies outside the image is as the nearest pixel inside.
-    fn copy_window = copy_window_narrow, (
-        image: &GrayImage,
-        corner: [i32; 2],
-        side: usize,
-        window: &mut Window,
-    )
-}
-
-#[inline(always)]
-fn copy_window_narrow(image: &GrayImage, corner: [i32; 2], side: usize, window: &mut Window) {
-    let [left, top] = corner;
-    let (last_x, last_y) = (image.width() as i32 - 1, image.height() as i32 - 1);
-    // Whole registers, as far as the image goes.
-    let columns = side.next_multiple_of(16);
-    let is_inside = left >= 0 && left + columns as i32 - 1 <= last_x;
-    let rows = window.chunks_exact_mut(PITCH).take(side);
-    for (y, to) in (top..).zip(rows) {
-        let row = image.row(y.clamp(0, last_y) as u32);
-        let below = image.row((y + 1).clamp(0, last_y) as u32);
-        if is_inside {
-            let row = row[left as usize..][..columns].as_chunks::<16>().0;
-            let below = below[left as usize..][..columns].as_chunks::<16>().0;
-            let to = to[..columns].as_chunks_mut::<16>().0;
-            for ((to, row), below) in to.iter_mut().zip(row).zip(below) {
-                for x in 0..16 {
-                    to[x] = pair(row[x], below[x]);
-                }
-            }
-        } else {
-            for (x, to) in (left..).zip(&mut to[..side]) {
-                let x = x.clamp(0, last_x) as usize;
-                *to = pair(row[x], below[x]);
-            }
-        }
-    }
-}
-
-/// A pixel and the one below it as the window holds them.
-#[inline(always)]
-fn pair(pixel: u8, below: u8) -> u16 {
-    u16::from(pixel) | u16::from(below) << 8
 }
 
 widened! {
@@ -174,17 +121,25 @@ fn sample_narrow(
     let across = [line(0.0, spacing_px * cos), line(0.0, spacing_px * sin)];
     let down_x = line(centre_px[0], -spacing_px * sin);
     let down_y = line(centre_px[1], spacing_px * cos);
-    let starts_x = down_x.as_chunks::<SAMPLES_PER_CELL>().0;
-    let starts_y = down_y.as_chunks::<SAMPLES_PER_CELL>().0;
-    for ((cells, x0), y0) in cells.iter_mut().zip(starts_x).zip(starts_y) {
+    let pixels = Pixels {
+        pitch: window.level.pitch(),
+        pairs: window.level.from(window.left, window.top),
+    };
+    for row in 0..CELLS {
         let mut sums = [0.0; SAMPLES_PADDED];
-        for (&x0, &y0) in x0.iter().zip(y0) {
-            add_row(window, &across, [x0, y0], &mut sums);
+        for a in row * SAMPLES_PER_CELL..(row + 1) * SAMPLES_PER_CELL {
+            add_row(&pixels, &across, [down_x[a], down_y[a]], &mut sums);
         }
-        for (cell, samples) in cells.iter_mut().zip(sums.as_chunks::<SAMPLES_PER_CELL>().0) {
-            *cell = samples[0] + samples[1];
+        for column in 0..CELLS {
+            cells[row][column] = sums[2 * column] + sums[2 * column + 1];
         }
     }
+}
+
+/// The pixels of a window, row by row, each with the one below it in its upper byte.
+struct Pixels<'a> {
+    pitch: usize,
+    pairs: &'a [u16],
 }
 
 /// One coordinate of the samples of a row or a column, in 2⁻¹⁵ px.
@@ -203,25 +158,28 @@ fn line(middle_px: f32, step_px: f32) -> [i32; SAMPLES_PADDED] {
 /// Adds the interpolated samples of a row to `sums`.
 #[inline(always)]
 fn add_row(
-    window: &Window,
+    pixels: &Pixels,
     across: &[[i32; SAMPLES_PADDED]; 2],
     [x0, y0]: [i32; 2],
     sums: &mut [f32; SAMPLES_PADDED],
 ) {
     const FRACTION: i32 = (1 << FRACTION_BITS) - 1;
+    let pitch = pixels.pitch as i32;
     let mut places = [0_u32; SAMPLES_PADDED];
     let (mut right, mut low) = ([0.0_f32; SAMPLES_PADDED], [0.0_f32; SAMPLES_PADDED]);
     for b in 0..SAMPLES_PADDED {
         let (x, y) = (x0 + across[0][b], y0 + across[1][b]);
-        places[b] = ((y >> FRACTION_BITS) * PITCH as i32 + (x >> FRACTION_BITS)) as u32;
+        places[b] = ((y >> FRACTION_BITS) * pitch + (x >> FRACTION_BITS)) as u32;
         right[b] = (x & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
         low[b] = (y & FRACTION) as f32 * (1.0 / (FRACTION + 1) as f32);
     }
+    // Of equal length, so that one look at a place does for both.
+    let last = pixels.pairs.len() - 1;
+    let (pairs, next) = (&pixels.pairs[..last], &pixels.pairs[1..][..last]);
     let mut quads = [0_u32; SAMPLES_PADDED];
     for b in 0..SAMPLES {
-        // The mask never changes a place: it tells the compiler that it lies in the window.
-        let place = places[b] as usize & LAST;
-        quads[b] = u32::from(window[place]) | u32::from(window[place + 1]) << 16;
+        let place = places[b] as usize;
+        quads[b] = u32::from(pairs[place]) | u32::from(next[place]) << 16;
     }
     for b in 0..SAMPLES_PADDED {
         let pixel = |byte: u32| ((quads[b] >> (8 * byte)) & 0xff) as i32 as f32;
@@ -283,42 +241,15 @@ mod tests {
     }
 
     #[test]
-    fn outside_the_image_is_its_border() {
-        let image = GrayImage::from_vec(2, 2, vec![10, 20, 30, 40]).unwrap_or_default();
-        let mut window = [0; LAST + 2];
-        copy_window(&image, [-1, -1], 4, &mut window);
-        let rows: Vec<u16> = window
-            .chunks(PITCH)
-            .take(4)
-            .flat_map(|r| &r[..4])
-            .map(|p| p % 256)
-            .collect();
-        assert_eq!(
-            rows,
-            [
-                10, 10, 20, 20, 10, 10, 20, 20, 30, 30, 40, 40, 30, 30, 40, 40
-            ]
-        );
-        let below: Vec<u16> = window
-            .chunks(PITCH)
-            .take(4)
-            .flat_map(|r| &r[..4])
-            .map(|p| p / 256)
-            .collect();
-        assert_eq!(
-            below,
-            [
-                10, 10, 20, 20, 30, 30, 40, 40, 30, 30, 40, 40, 30, 30, 40, 40
-            ]
-        );
-    }
-
-    #[test]
     fn wider_registers_give_the_same_bits() {
-        let mut window = [0; LAST + 2];
-        (0..)
-            .zip(&mut window)
-            .for_each(|(n, w): (u32, _)| *w = (n * n * 31 % 65_521) as u16);
+        let pixels = (0..150_u32 * 100).map(|n| (n * n * 31 % 251) as u8);
+        let image = GrayImage::from_vec(150, 100, pixels.collect()).unwrap_or_default();
+        let mut pyramid = Pyramid::default();
+        let window = Window {
+            level: pyramid.level(&image, 0),
+            left: 30,
+            top: -10,
+        };
         let direction = Direction {
             angle_rad: 1.0,
             cos: 0.540_302_3,

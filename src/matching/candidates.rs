@@ -40,6 +40,7 @@ pub(super) trait Window {
     fn for_each_in(&self, i: u32, visit: impl FnMut(u32));
 
     /// Whether feature `j` of the second list lies in the window of feature `i` of the first.
+    #[cfg(feature = "opencv")]
     fn holds(&self, i: u32, j: u32) -> bool;
 }
 
@@ -65,6 +66,13 @@ impl Candidates {
     }
 
     /// Calls `visit` for each candidate pair, once, in a fixed order. All lie in the window.
+    #[cfg_attr(
+        not(feature = "opencv"),
+        expect(
+            unused_variables,
+            reason = "the guided search has no use for the second list"
+        )
+    )]
     pub(super) fn for_each<A: Fn(u32) -> u32, B: Fn(u32) -> u32>(
         &self,
         a: &Chosen<'_, A>,

@@ -1,7 +1,13 @@
 //! Comparing descriptors: distance, the best of several candidates, and the tests a match passes.
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use super::Settings;
-use crate::features::Keypoint;
+use crate::features::{Features, Keypoint};
+use crate::simd::widened;
 
 /// Lanes of partial sums: the compiler turns them into vector registers, and the fixed order of
 /// additions keeps the bits the same everywhere.
@@ -14,34 +20,33 @@ const BLOCKS_A_LOOK: usize = 2;
 /// most often shows long before the end.
 ///
 /// Partial sums never shrink, not even by rounding: what exceeds `reach` half-way does so at the end.
-pub(super) fn squared_distance_within(a: &[f32], b: &[f32], reach: f32) -> Option<f32> {
+#[inline(always)]
+fn squared_distance_within(a: &[f32], b: &[f32], reach: f32) -> Option<f32> {
     let mut sums = [0.0_f32; LANES];
     let (a_blocks, a_rest) = a.as_chunks::<LANES>();
     let (b_blocks, b_rest) = b.as_chunks::<LANES>();
-    let looks = a_blocks
-        .chunks(BLOCKS_A_LOOK)
-        .zip(b_blocks.chunks(BLOCKS_A_LOOK));
-    for (xs, ys) in looks {
-        for (x, y) in xs.iter().zip(ys) {
-            for lane in 0..LANES {
-                let d = x[lane] - y[lane];
-                sums[lane] += d * d;
-            }
+    let blocks = a_blocks.len().min(b_blocks.len());
+    for block in 0..blocks {
+        let (x, y) = (&a_blocks[block], &b_blocks[block]);
+        for lane in 0..LANES {
+            let d = x[lane] - y[lane];
+            sums[lane] += d * d;
         }
-        if total(sums) > reach {
+        let is_look = (block + 1) % BLOCKS_A_LOOK == 0 || block + 1 == blocks;
+        if is_look && total(sums) > reach {
             return None;
         }
     }
-    let rest: f32 = a_rest
-        .iter()
-        .zip(b_rest)
-        .map(|(x, y)| (x - y) * (x - y))
-        .sum();
+    let mut rest = 0.0;
+    for n in 0..a_rest.len().min(b_rest.len()) {
+        rest += (a_rest[n] - b_rest[n]) * (a_rest[n] - b_rest[n]);
+    }
     let squared = total(sums) + rest;
     (squared <= reach).then_some(squared)
 }
 
 /// The sum over all lanes, in a fixed order.
+#[inline(always)]
 fn total(mut sums: [f32; LANES]) -> f32 {
     let mut width = LANES / 2;
     while width > 0 {
@@ -76,13 +81,9 @@ impl Best {
         second_squared: f32::INFINITY,
     };
 
-    /// The squared distance that a candidate must undercut to be taken note of.
-    pub(super) fn second_squared(&self) -> f32 {
-        self.second_squared
-    }
-
     /// Takes note of a candidate.
-    pub(super) fn offer(&mut self, index: u32, squared: f32) {
+    #[inline(always)]
+    fn offer(&mut self, index: u32, squared: f32) {
         if squared < self.squared {
             self.second_squared = self.squared;
             self.squared = squared;
@@ -100,6 +101,60 @@ impl Best {
             && self.squared <= limit2
             && self.squared <= ratio2 * self.second_squared)
             .then_some(self.index)
+    }
+}
+
+/// One feature that is compared with its candidates.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Seeker<'a> {
+    /// Its number in its list.
+    pub(super) number: u32,
+    /// Its descriptor.
+    pub(super) descriptor: &'a [f32],
+    /// The squared distance beyond which nothing matters.
+    pub(super) greatest_reach: f32,
+}
+
+/// A candidate.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Candidate {
+    /// Its number in its list.
+    pub(super) number: u32,
+    /// Its descriptor's number among those of its image.
+    pub(super) feature: u32,
+}
+
+widened! {
+    /// Compares a feature with candidates among the features of an image, one after the other: the
+    /// feature's best two and theirs, by their numbers, take note of each other.
+    pub(super) fn compare = compare_narrow, (
+        seeker: Seeker<'_>,
+        candidates: &[Candidate],
+        features: &Features,
+        best: &mut Best,
+        bests: &mut [Best],
+    )
+}
+
+#[inline(always)]
+fn compare_narrow(
+    seeker: Seeker<'_>,
+    candidates: &[Candidate],
+    features: &Features,
+    best: &mut Best,
+    bests: &mut [Best],
+) {
+    for n in 0..candidates.len() {
+        let Candidate { number, feature } = candidates[n];
+        let other = &mut bests[number as usize];
+        // What is farther than both second bests changes neither.
+        let farther = best.second_squared.max(other.second_squared);
+        let reach = farther.min(seeker.greatest_reach);
+        let descriptor = features.descriptor(feature as usize);
+        if let Some(squared) = squared_distance_within(seeker.descriptor, descriptor, reach) {
+            best.offer(number, squared);
+            other.offer(seeker.number, squared);
+        }
     }
 }
 

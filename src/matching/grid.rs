@@ -73,6 +73,7 @@ impl Grid {
     }
 
     /// Whether the point numbered `n` lies within `radius_px` of a place.
+    #[cfg(any(test, feature = "opencv"))]
     pub(super) fn is_near(&self, n: u32, at: &Vector2<f64>, radius_px: f64) -> bool {
         let (_, x, y) = self.in_order[n as usize];
         within(x, y, at, radius_px)

@@ -5,7 +5,7 @@
 
 use super::Settings;
 use super::candidates::{Candidates, MatchError, Window};
-use super::descriptor::{Best, compatible, greatest_reach, squared_distance_within};
+use super::descriptor::{Best, Candidate, Seeker, compare, compatible, greatest_reach};
 use crate::features::{Features, Keypoint};
 
 /// Some of an image's features, numbered anew: number `i` is the image's feature `feature_of(i)`.
@@ -44,6 +44,7 @@ impl<F: Fn(u32) -> u32> Chosen<'_, F> {
 pub(super) struct Pairing {
     settings: Settings,
     candidates: Candidates,
+    nearby: Vec<Candidate>,
     b_of_a: Vec<Best>,
     a_of_b: Vec<Best>,
 }
@@ -53,6 +54,7 @@ impl Pairing {
         Self {
             candidates: Candidates::new(&settings),
             settings,
+            nearby: Vec::new(),
             b_of_a: Vec::new(),
             a_of_b: Vec::new(),
         }
@@ -68,6 +70,7 @@ impl Pairing {
         let Self {
             settings,
             candidates,
+            nearby,
             b_of_a,
             a_of_b,
         } = self;
@@ -75,22 +78,37 @@ impl Pairing {
         b_of_a.resize(a.count as usize, Best::NONE);
         a_of_b.clear();
         a_of_b.resize(b.count as usize, Best::NONE);
-        let greatest = greatest_reach(settings);
+        let greatest_reach = greatest_reach(settings);
+        let mut settle = |number: u32, nearby: &mut Vec<Candidate>| {
+            let seeker = Seeker {
+                number,
+                descriptor: a.descriptor(number),
+                greatest_reach,
+            };
+            let best = &mut b_of_a[number as usize];
+            compare(seeker, nearby, b.features, best, a_of_b);
+            nearby.clear();
+        };
+        nearby.clear();
+        let mut seeking = 0;
         candidates.for_each(a, b, window, |i, j| {
-            if !compatible(a.keypoint(i), b.keypoint(j), settings) {
-                return;
+            if i != seeking {
+                if !nearby.is_empty() {
+                    settle(seeking, nearby);
+                }
+                seeking = i;
             }
-            let (best_b, best_a) = (&mut b_of_a[i as usize], &mut a_of_b[j as usize]);
-            let reach = best_b
-                .second_squared()
-                .max(best_a.second_squared())
-                .min(greatest);
-            if let Some(squared) = squared_distance_within(a.descriptor(i), b.descriptor(j), reach)
-            {
-                best_b.offer(j, squared);
-                best_a.offer(i, squared);
+            if compatible(a.keypoint(i), b.keypoint(j), settings) {
+                nearby.push(Candidate {
+                    number: j,
+                    feature: (b.feature_of)(j),
+                });
             }
-        })
+        })?;
+        if !nearby.is_empty() {
+            settle(seeking, nearby);
+        }
+        Ok(())
     }
 
     /// The partner of `i` in the last search, if each likes the other best.

@@ -157,6 +157,7 @@ impl Window for EpipolarBand {
         }
     }
 
+    #[cfg(feature = "opencv")]
     fn holds(&self, i: u32, j: u32) -> bool {
         let (Some(left), Some(right)) = (&self.left[i as usize], &self.right[j as usize]) else {
             return false;

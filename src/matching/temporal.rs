@@ -151,6 +151,7 @@ impl<P: Fn(u32) -> Option<Vector2<f64>>> Window for SearchCircle<'_, P> {
         }
     }
 
+    #[cfg(feature = "opencv")]
     fn holds(&self, m: u32, n: u32) -> bool {
         (self.predicted)(m).is_some_and(|at| self.grid.is_near(n, &at, self.radius_px))
     }

@@ -100,7 +100,7 @@ impl Settings {
     pub(super) fn chain<'a>(
         &self,
         rig: &'a StereoRig,
-        model: crate::estimation::Model,
+        model: estimation::Model,
     ) -> TwoFrameChain<'a> {
         let chain = TwoFrameChain::new(
             rig,

@@ -2,6 +2,7 @@
 
 mod driver;
 mod gallery;
+mod histogram;
 mod method;
 mod occupancy;
 mod statistics;

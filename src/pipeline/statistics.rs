@@ -1,6 +1,7 @@
 //! What a run came to: counts, latencies stage by stage, processor time and memory.
 
 use super::StageLatencies;
+use super::histogram::Histogram;
 use crate::estimation::{Odometry, Status};
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -11,7 +12,7 @@ pub struct Statistics {
     started: Instant,
     cpu_at_start: Duration,
     counts: RunCounts,
-    samples: [Vec<f32>; STAGES.len()],
+    latencies: [Histogram; STAGES.len()],
     inliers: u64,
     path_m: f64,
     first_ns: Option<i64>,
@@ -86,7 +87,7 @@ impl Statistics {
             started: Instant::now(),
             cpu_at_start: cpu_time(),
             counts: RunCounts::default(),
-            samples: Default::default(),
+            latencies: Default::default(),
             inliers: 0,
             path_m: 0.0,
             first_ns: None,
@@ -119,8 +120,8 @@ impl Statistics {
             latencies.estimation,
             latencies.total,
         ];
-        for (samples, took) in self.samples.iter_mut().zip(stages) {
-            samples.push(took.as_secs_f32() * 1e3);
+        for (latencies, took) in self.latencies.iter_mut().zip(stages) {
+            latencies.add(took);
         }
     }
 
@@ -150,28 +151,21 @@ impl Statistics {
             mean_inliers: self.inliers as f64 / measured,
             latency_ms: STAGES
                 .iter()
-                .zip(&self.samples)
-                .map(|(stage, samples)| StageFigures::of(stage, samples))
+                .zip(&self.latencies)
+                .map(|(stage, latencies)| StageFigures::of(stage, latencies))
                 .collect(),
         }
     }
 }
 
 impl StageFigures {
-    fn of(stage: &'static str, samples: &[f32]) -> Self {
-        let mut sorted = samples.to_vec();
-        sorted.sort_by(f32::total_cmp);
-        let quantile = |share: f64| {
-            let at = (share * sorted.len() as f64).ceil() as usize;
-            sorted
-                .get(at.clamp(1, sorted.len().max(1)) - 1)
-                .map_or(0.0, |&v| f64::from(v))
-        };
+    fn of(stage: &'static str, latencies: &Histogram) -> Self {
+        let ms = |time: Duration| time.as_secs_f64() * 1e3;
         Self {
             stage,
-            median: quantile(0.5),
-            p99: quantile(0.99),
-            max: quantile(1.0),
+            median: ms(latencies.quantile(0.5)),
+            p99: ms(latencies.quantile(0.99)),
+            max: ms(latencies.greatest()),
         }
     }
 }
@@ -191,21 +185,4 @@ fn peak_memory_mb() -> f64 {
     let line = status.lines().find_map(|l| l.strip_prefix("VmHWM:"));
     let kib = line.and_then(|l| l.trim().trim_end_matches("kB").trim().parse::<f64>().ok());
     kib.unwrap_or(0.0) * 1024.0 / 1e6
-}
-
-#[cfg(test)]
-mod tests {
-    use super::*;
-
-    #[test]
-    fn quantiles_are_those_of_the_sorted_samples() {
-        let samples: Vec<f32> = (1..=100).rev().map(|v| v as f32).collect();
-        let figures = StageFigures::of("features", &samples);
-        assert_eq!(
-            (figures.median, figures.p99, figures.max),
-            (50.0, 99.0, 100.0)
-        );
-        let none = StageFigures::of("features", &[]);
-        assert_eq!((none.median, none.p99, none.max), (0.0, 0.0, 0.0));
-    }
 }

@@ -1,10 +1,12 @@
 //! How long SURF takes on a synthetic image: `cargo bench --bench features`.
 //!
-//! One thread, 1280 × 960 px, for several budgets; best and median of many runs. With a number
+//! One thread, 1280 × 960 px, for several budgets; best and median processor time of many runs. With a number
 //! after `--` only the case of that number, counted from 0, as a profiler likes it.
 
+mod common;
+
+use common::{Times, head, line};
 use std::hint::black_box;
-use std::time::{Duration, Instant};
 use visod::features::surf::{Settings, Surf};
 use visod::features::{Extractor, Features};
 use visod::image::GrayImage;
@@ -14,12 +16,11 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 
 const WIDTH: u32 = 1280;
 const HEIGHT: u32 = 960;
-const RUNS: usize = 60;
+const RUNS: usize = 100;
 
 fn main() {
     let image = scene();
-    println!("{WIDTH} × {HEIGHT} px, {RUNS} runs, one thread");
-    println!("hessian  budget  extended  keypoints    best ms  median ms");
+    head("Features: SURF, 1280 × 960 px, one thread");
     let cases = [
         (1e6, 0, false),
         (100.0, 1000, false),
@@ -28,7 +29,7 @@ fn main() {
         (400.0, 0, false),
         (100.0, 1000, true),
     ];
-    let chosen: Option<usize> = std::env::args().find_map(|argument| argument.parse().ok());
+    let chosen: Option<usize> = common::words().first().and_then(|word| word.parse().ok());
     for (number, (hessian, budget, extended)) in cases.into_iter().enumerate() {
         if chosen.is_some_and(|chosen| chosen != number) {
             continue;
@@ -39,33 +40,25 @@ fn main() {
             extended,
             ..Settings::default()
         };
-        let (best, median, keypoints) = time(settings, &image);
-        println!(
-            "{hessian:>7}  {budget:>6}  {extended:>8}  {keypoints:>9}  {:>9.2}  {:>9.2}",
-            1e3 * best.as_secs_f64(),
-            1e3 * median.as_secs_f64()
-        );
+        let floats = if extended { 128 } else { 64 };
+        let (times, keypoints) = time(settings, &image);
+        let name = format!("{keypoints} keypoints, {floats} floats, threshold {hessian}");
+        line(&name, &times, "");
     }
 }
 
-/// Best and median time, and the number of keypoints found.
-fn time(settings: Settings, image: &GrayImage) -> (Duration, Duration, usize) {
+/// The times, and the number of keypoints found.
+fn time(settings: Settings, image: &GrayImage) -> (Times, usize) {
     let mut features = Features::default();
     let mut surf = match Surf::new(settings) {
         Ok(surf) => surf,
         Err(e) => unreachable!("{}: {}", e.key, e.cause),
     };
-    let mut times: Vec<Duration> = (0..RUNS)
-        .map(|_| {
-            let start = Instant::now();
-            let result = surf.extract(black_box(image), &mut features);
-            let elapsed = start.elapsed();
-            assert_eq!(result, Ok(()));
-            elapsed
-        })
-        .collect();
-    times.sort_unstable();
-    (times[0], times[RUNS / 2], features.len())
+    let times = Times::of(RUNS, || {
+        let result = surf.extract(black_box(image), &mut features);
+        assert_eq!(result, Ok(()));
+    });
+    (times, features.len())
 }
 
 /// Five thousand discs and rectangles of all sizes and greys on one another, softened, with noise.

@@ -4,10 +4,12 @@
 //! prediction and over time far around; best and median of many runs. With OpenCV, FLANN as well.
 //! The checksum tells whether two versions found the same.
 
+mod common;
+
+use common::Times;
 use nalgebra::{Isometry3, Point3, Vector3, Vector4};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
-use std::time::{Duration, Instant};
 use visod::features::{Features, Keypoint};
 use visod::geometry::{Rectification, StereoRig};
 use visod::matching::{MatchedPair, MatcherName, Settings, StereoMatcher, TemporalMatcher};
@@ -19,10 +21,11 @@ const RUNS: usize = 200;
 const DESCRIPTOR_LEN: usize = 64;
 
 fn main() {
-    println!("{WIDTH} × {HEIGHT} px, two pairs, best (median) ms of {RUNS} runs, one thread");
+    println!("\n### Matching: two pairs of {WIDTH} × {HEIGHT} px, one thread, best (median) ms\n");
     println!(
-        "matcher  features  left–right       over time        far around       matches  tracks  checksum"
+        "| matcher | features | left–right | over time | far around | matches | tracks | checksum |"
     );
+    println!("|---|---:|---:|---:|---:|---:|---:|---|");
     for count in [1000, 2000, 4000] {
         measure("guided", Settings::default(), count, RUNS);
     }
@@ -73,7 +76,7 @@ fn measure(name: &str, settings: Settings, count: usize, runs: usize) {
         checksum.add(m.left, m.right);
     }
     let mut tracks = Vec::new();
-    let mut over_time = [(Duration::ZERO, Duration::ZERO); 2];
+    let mut over_time = [(0.0, 0.0); 2];
     let mut track_count = 0;
     for (timed, radius_px) in over_time.iter_mut().zip([near_px, wide_px]) {
         *timed = time(runs, || {
@@ -99,12 +102,9 @@ fn measure(name: &str, settings: Settings, count: usize, runs: usize) {
             checksum.add(t.before, t.now);
         }
     }
-    let ms = |(best, median): (Duration, Duration)| {
-        let [best, median] = [best, median].map(|d| 1e3 * d.as_secs_f64());
-        format!("{best:>6.3} ({median:>6.3})")
-    };
+    let ms = |(best, median): (f64, f64)| format!("{best:.3} ({median:.3})");
     println!(
-        "{name:<7}  {count:>8}  {}  {}  {}  {:>7}  {track_count:>6}  {:016x}",
+        "| {name} | {count} | {} | {} | {} | {} | {track_count} | {:016x} |",
         ms(left_right),
         ms(over_time[0]),
         ms(over_time[1]),
@@ -114,16 +114,9 @@ fn measure(name: &str, settings: Settings, count: usize, runs: usize) {
 }
 
 /// Best and median time.
-fn time(runs: usize, mut run: impl FnMut()) -> (Duration, Duration) {
-    let mut times: Vec<Duration> = (0..runs)
-        .map(|_| {
-            let start = Instant::now();
-            run();
-            start.elapsed()
-        })
-        .collect();
-    times.sort_unstable();
-    (times[0], times[runs / 2])
+fn time(runs: usize, run: impl FnMut()) -> (f64, f64) {
+    let times = Times::of(runs, run);
+    (times.best_ms(), times.median_ms())
 }
 
 /// FNV-1a over pairs of numbers.

@@ -1,15 +1,18 @@
-//! How fast OpenCV is on this machine, as a yardstick for this crate: detection with SIFT, ORB and AKAZE, and
-//! undistortion by `remap`, of a textured image of 1280 × 960 pixels, in one thread.
+//! visod's SURF beside OpenCV's SIFT, ORB and AKAZE, and its `remap`, of a textured image of
+//! 1280 × 960 pixels, in one thread and one run.
 //!
 //! `. tools/env && cargo bench --features opencv --bench opencv` prints a table; a number of runs may
-//! follow, ` -- 40`.
+//! follow, ` -- 40`. The last column is how many times as long as visod's SURF.
 
+mod common;
+
+use common::{Times, head, line, ratio};
 use opencv::core::{BORDER_CONSTANT, Mat, Scalar};
 use opencv::imgproc::{INTER_LINEAR, remap};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
-use std::time::{Duration, Instant};
 use visod::features::opencv::{Detector, OpencvExtractor, Settings};
+use visod::features::surf::{self, Surf};
 use visod::features::{Extractor, Features};
 use visod::image::GrayImage;
 
@@ -20,51 +23,43 @@ const RUNS: usize = 20;
 type Outcome<T> = Result<T, Box<dyn std::error::Error>>;
 
 fn main() -> Outcome<()> {
-    // Cargo adds `--bench` of its own.
-    let runs = std::env::args()
-        .skip(1)
-        .find(|argument| !argument.starts_with("--"))
-        .map_or(Ok(RUNS), |argument| argument.parse())?;
+    let runs = common::words()
+        .first()
+        .map_or(Ok(RUNS), |word| word.parse())?;
     let image = texture();
-    println!("{WIDTH} × {HEIGHT} pixels, one thread, {runs} runs");
-    println!("{:<28} {:>10} {:>10}", "", "median ms", "best ms");
+    let mut surf = Surf::new(surf::Settings::default()).map_err(|e| e.key)?;
+    let mut features = Features::default();
+    let ours = Times::of(runs, || {
+        assert_eq!(surf.extract(&image, &mut features), Ok(()));
+    });
+    head(&format!(
+        "Beside OpenCV: {WIDTH} × {HEIGHT} px, one thread, {runs} runs"
+    ));
+    let name = format!("visod's SURF, {} features", features.len());
+    line(&name, &ours, "1 ×");
     for detector in [Detector::Sift, Detector::Orb, Detector::Akaze] {
         let mut extractor = OpencvExtractor::new(detector, &Settings::default())?;
-        let mut features = Features::default();
-        let times = time(runs, || Ok(extractor.extract(&image, &mut features)?))?;
-        print(
-            &format!("{}, {} features", detector.as_str(), features.len()),
-            &times,
+        let times = Times::of(runs, || {
+            assert_eq!(extractor.extract(&image, &mut features), Ok(()));
+        });
+        let name = format!(
+            "OpenCV's {}, {} features",
+            detector.as_str(),
+            features.len()
         );
+        line(&name, &times, &ratio(&times, &ours));
     }
-    print("remap, bilinear", &time_remap(runs, &image)?);
+    let remap = time_remap(runs, &image)?;
+    line(
+        "OpenCV's remap, bilinear, one image",
+        &remap,
+        &ratio(&remap, &ours),
+    );
     Ok(())
 }
 
-/// The times of `runs` runs after a first that does not count, shortest first.
-fn time(runs: usize, mut run: impl FnMut() -> Outcome<()>) -> Outcome<Vec<Duration>> {
-    run()?;
-    let mut times = Vec::with_capacity(runs);
-    for _ in 0..runs {
-        let start = Instant::now();
-        run()?;
-        times.push(start.elapsed());
-    }
-    times.sort();
-    Ok(times)
-}
-
-fn print(what: &str, times: &[Duration]) {
-    let ms = |time: Option<&Duration>| time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e3);
-    println!(
-        "{what:<28} {:>10.2} {:>10.2}",
-        ms(times.get(times.len() / 2)),
-        ms(times.first())
-    );
-}
-
 /// With float maps that bend the image as a lens does.
-fn time_remap(runs: usize, image: &GrayImage) -> Outcome<Vec<Duration>> {
+fn time_remap(runs: usize, image: &GrayImage) -> Outcome<Times> {
     let (rows, cols) = (i32::try_from(HEIGHT)?, i32::try_from(WIDTH)?);
     let (mut xs, mut ys) = (Vec::new(), Vec::new());
     for row in 0..HEIGHT {
@@ -80,8 +75,8 @@ fn time_remap(runs: usize, image: &GrayImage) -> Outcome<Vec<Duration>> {
     let xs = Mat::new_rows_cols_with_data(rows, cols, &xs)?;
     let ys = Mat::new_rows_cols_with_data(rows, cols, &ys)?;
     let mut straight = Mat::default();
-    time(runs, || {
-        Ok(remap(
+    Ok(Times::of(runs, || {
+        let result = remap(
             &source,
             &mut straight,
             &xs,
@@ -89,8 +84,9 @@ fn time_remap(runs: usize, image: &GrayImage) -> Outcome<Vec<Duration>> {
             INTER_LINEAR,
             BORDER_CONSTANT,
             Scalar::default(),
-        )?)
-    })
+        );
+        assert!(result.is_ok());
+    }))
 }
 
 /// Value noise of five octaves, from 64 pixels down to 4: detail at every scale, as in a photograph.

@@ -6,9 +6,9 @@
 /// Nothing but the width changes: Rust neither reorders nor fuses floating-point operations, so
 /// either way the same operations give the same bits.
 macro_rules! widened {
-    ($(#[$attribute:meta])* fn $name:ident = $body:path, ($($argument:ident: $type:ty),* $(,)?)) => {
+    ($(#[$attribute:meta])* $visibility:vis fn $name:ident = $body:path, ($($argument:ident: $type:ty),* $(,)?)) => {
         $(#[$attribute])*
-        fn $name($($argument: $type),*) {
+        $visibility fn $name($($argument: $type),*) {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2")]
@@ -26,7 +26,7 @@ macro_rules! widened {
     };
 }
 
-pub(super) use widened;
+pub(crate) use widened;
 
 /// `1.5 · 2²³`: a float of magnitude below 2²² added to it has no room for its fraction.
 const SHIFT: f32 = 12_582_912.0;
@@ -34,7 +34,7 @@ const SHIFT: f32 = 12_582_912.0;
 /// `value` rounded to the nearest integer, halves to the even one, for magnitudes below 2²²; in
 /// two additions, where a call of the library would keep a loop from being widened.
 #[inline(always)]
-pub(super) fn round_i32(value: f32) -> i32 {
+pub(crate) fn round_i32(value: f32) -> i32 {
     (value + SHIFT).to_bits().wrapping_sub(SHIFT.to_bits()) as i32
 }
 

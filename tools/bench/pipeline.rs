@@ -1,0 +1,266 @@
+//! How long a whole pair takes, from images in memory to its row: `cargo bench --bench pipeline`.
+//!
+//! With words after `--` it shows something else: `growth`, how the time grows with pixels and with
+//! keypoints; `endurance [PAIRS]`, whether time and memory stay flat over 10,000 pairs;
+//! `paced [HZ]`, the latency of a steady stream of 40 pairs a second; `profile [PAIRS]`, the
+//! simulated recording once, as a profiler likes it.
+
+mod common;
+
+use common::memory::{Recording, ToAndFro};
+use common::{memory_mb, ms, process_time, words};
+use std::convert::Infallible;
+use std::ops::ControlFlow;
+use std::time::{Duration, Instant};
+use visod::capture::Realtime;
+use visod::capture::{PairEvent, PairSource, StereoPair};
+use visod::features::{self, Extractor};
+use visod::geometry::StereoRig;
+use visod::pipeline::{self, Delivery, Method, StageLatencies};
+use visod::simulation::{small_rig, thesis_rig};
+
+/// Pairs of one measurement.
+const PAIRS: u64 = 100;
+/// Pairs before that, which grow the buffers.
+const WARM_UP: u64 = 20;
+/// Different pairs of a simulated recording.
+const FRAMES: u64 = 12;
+
+fn main() {
+    let words = words();
+    let number = words.get(1).and_then(|word| word.parse().ok());
+    match words.first().map(String::as_str) {
+        Some("growth") => growth(),
+        Some("endurance") => endurance(number.unwrap_or(10_000.0) as u64),
+        Some("paced") => paced(number.unwrap_or(40.0)),
+        Some("profile") => {
+            let recording = Recording::simulated(thesis_rig(), FRAMES);
+            let run = Run::of(&recording, number.unwrap_or(300.0) as u64, 1000, 2);
+            println!("{:.2} ms of processor time a pair", run.cpu_ms);
+        }
+        _ => throughput(),
+    }
+}
+
+/// What a run over a recording in memory came to.
+struct Run {
+    wall_ms: f64,
+    cpu_ms: f64,
+    /// Of each counted pair.
+    latencies: Vec<StageLatencies>,
+}
+
+impl Run {
+    fn of(recording: &Recording, pairs: u64, budget: usize, workers: usize) -> Self {
+        let source = recording.source(WARM_UP + pairs);
+        Self::over(&recording.rig, source, budget, workers, |_| ())
+    }
+
+    /// Carries a whole source through the pipeline; `see` is told of each counted pair.
+    fn over(
+        rig: &StereoRig,
+        source: impl PairSource,
+        budget: usize,
+        workers: usize,
+        mut see: impl FnMut(usize),
+    ) -> Self {
+        let (matching, estimation) = (Default::default(), Default::default());
+        let Some(mut method) = Method::new(rig.clone(), matching, estimation) else {
+            unreachable!("the cameras stand side by side")
+        };
+        let extractors = (0..workers).map(|_| extractor(budget)).collect();
+        let (mut start, mut start_cpu) = (Instant::now(), process_time());
+        let mut rows = 0;
+        let mut latencies = Vec::with_capacity(1 << 14);
+        let deliver = |delivery: Delivery<'_>| {
+            rows += 1;
+            if rows == WARM_UP {
+                (start, start_cpu) = (Instant::now(), process_time());
+            } else if rows > WARM_UP {
+                latencies.push(delivery.latencies);
+                see(latencies.len());
+            }
+            Ok::<_, Infallible>(ControlFlow::Continue(()))
+        };
+        let result = pipeline::run(source, extractors, &mut method, deliver);
+        assert!(result.is_ok());
+        let counted = latencies.len().max(1) as f64;
+        Self {
+            wall_ms: ms(start.elapsed()) / counted,
+            cpu_ms: ms(process_time().saturating_sub(start_cpu)) / counted,
+            latencies,
+        }
+    }
+
+    /// A stage's latency that a share of the pairs does not exceed, ms.
+    fn quantile_ms(&self, stage: impl Fn(&StageLatencies) -> Duration, share: f64) -> f64 {
+        let mut times: Vec<Duration> = self.latencies.iter().map(stage).collect();
+        times.sort_unstable();
+        ms(times[(share * (times.len() - 1) as f64) as usize])
+    }
+}
+
+fn extractor(budget: usize) -> Box<dyn Extractor> {
+    let mut settings = features::Settings::default();
+    settings.surf.budget = budget;
+    match features::extractor(&settings) {
+        Ok(extractor) => extractor,
+        Err(e) => unreachable!("{}: {}", e.key, e.cause),
+    }
+}
+
+fn throughput() {
+    println!("\n### Pipeline: whole pairs from memory, 1,000 keypoints an image\n");
+    println!(
+        "| recording | workers | wall ms a pair | processor ms a pair | features | matching | estimation | estimation's share | resident MB |"
+    );
+    println!("|---|---:|---:|---:|---:|---:|---:|---:|---:|");
+    let simulated = Recording::simulated(thesis_rig(), FRAMES);
+    let kitti = Recording::recorded("kitti_straight", 20);
+    let recordings = [("1280 × 960", Some(simulated)), ("KITTI", kitti)];
+    for (name, recording) in recordings {
+        let Some(recording) = recording else {
+            println!("| {name} | skipped: the recording is not there |");
+            continue;
+        };
+        for workers in [2, 1] {
+            // The least disturbed of three.
+            let runs = [(); 3].map(|()| Run::of(&recording, PAIRS, 1000, workers));
+            let Some(run) = runs.iter().min_by(|a, b| a.cpu_ms.total_cmp(&b.cpu_ms)) else {
+                continue;
+            };
+            let wall_ms = runs
+                .iter()
+                .map(|run| run.wall_ms)
+                .fold(f64::INFINITY, f64::min);
+            let median = |stage: fn(&StageLatencies) -> Duration| run.quantile_ms(stage, 0.5);
+            let estimation_ms = median(|l| l.estimation);
+            println!(
+                "| {name} | {workers} | {wall_ms:.2} | {:.2} | {:.2} | {:.2} | {estimation_ms:.2} | {:.0} % | {:.0} |",
+                run.cpu_ms,
+                median(|l| l.features),
+                median(|l| l.matching),
+                100.0 * estimation_ms / run.cpu_ms,
+                memory_mb("VmRSS")
+            );
+        }
+    }
+    println!(
+        "\nThe stages' columns are medians on the wall; features are those of the slower image."
+    );
+}
+
+fn growth() {
+    println!("\n### Growth: processor time a pair\n");
+    println!(
+        "| image | megapixels | keypoints | features ms | per megapixel | matching ms | per thousand keypoints |"
+    );
+    println!("|---|---:|---:|---:|---:|---:|---:|");
+    let large = Recording::simulated(thesis_rig(), 4);
+    let twice = enlarged(&large);
+    let cases = [
+        ("640 × 480", Recording::simulated(small_rig(), 4), 1000),
+        ("1280 × 960", large.clone(), 500),
+        ("1280 × 960", large.clone(), 1000),
+        ("1280 × 960", large.clone(), 2000),
+        ("1280 × 960", large, 4000),
+        ("2560 × 1920", twice, 1000),
+    ];
+    for (name, recording, budget) in cases {
+        let runs = [(); 3].map(|()| Run::of(&recording, 40, budget, 1));
+        let best = |stage: fn(&StageLatencies) -> Duration| {
+            let times = runs.iter().map(|run| run.quantile_ms(stage, 0.1));
+            times.fold(f64::INFINITY, f64::min)
+        };
+        let image = &recording.pairs[0].left;
+        let megapixels = f64::from(image.width()) * f64::from(image.height()) * 1e-6;
+        let (features_ms, matching_ms) = (best(|l| l.features), best(|l| l.matching));
+        println!(
+            "| {name} | {megapixels:.2} | {budget} | {features_ms:.2} | {:.2} | {matching_ms:.2} | {:.2} |",
+            features_ms / megapixels,
+            1000.0 * matching_ms / budget as f64
+        );
+    }
+}
+
+/// A recording four times as large: each image beside and below itself.
+fn enlarged(recording: &Recording) -> Recording {
+    let tile = |image: &visod::image::GrayImage| {
+        let (width, height) = (image.width() as usize, image.height() as usize);
+        let mut pixels = Vec::with_capacity(4 * width * height);
+        for y in 0..2 * height {
+            let row = image.row((y % height) as u32);
+            pixels.extend_from_slice(row);
+            pixels.extend_from_slice(row);
+        }
+        match visod::image::GrayImage::from_vec(2 * width as u32, 2 * height as u32, pixels) {
+            Some(image) => image,
+            None => unreachable!("as many pixels as the size says"),
+        }
+    };
+    let mut rig = recording.rig.clone();
+    for camera in [&mut rig.left, &mut rig.right] {
+        (camera.width, camera.height) = (2 * camera.width, 2 * camera.height);
+    }
+    let pairs = recording.pairs.iter().map(|pair| StereoPair {
+        left: tile(&pair.left),
+        right: tile(&pair.right),
+        ..pair.clone()
+    });
+    Recording {
+        rig,
+        pairs: pairs.collect(),
+    }
+}
+
+fn endurance(pairs: u64) {
+    println!("\n### Endurance: {pairs} pairs of 640 × 480\n");
+    println!("| pairs | processor ms a pair | resident MB |");
+    println!("|---:|---:|---:|");
+    let recording = Recording::simulated(small_rig(), FRAMES);
+    let lap = (pairs / 10).max(1) as usize;
+    let mut start = process_time();
+    let see = |counted: usize| {
+        if counted % lap == 0 {
+            let cpu_ms = ms(process_time() - start) / lap as f64;
+            println!("| {counted} | {cpu_ms:.2} | {:.1} |", memory_mb("VmRSS"));
+            start = process_time();
+        }
+    };
+    let source = recording.source(WARM_UP + pairs);
+    Run::over(&recording.rig, source, 1000, 2, see);
+}
+
+/// Stamps pairs with the rate at which they are to come.
+struct Rate(ToAndFro, f64);
+
+impl PairSource for Rate {
+    fn next_event(&mut self) -> Option<PairEvent> {
+        let mut event = self.0.next_event()?;
+        if let PairEvent::Pair(pair) = &mut event {
+            pair.timestamp_ns = (pair.sequence as f64 * 1e9 / self.1) as i64;
+        }
+        Some(event)
+    }
+
+    fn recycle(&mut self, pair: StereoPair) {
+        self.0.recycle(pair);
+    }
+}
+
+fn paced(rate_hz: f64) {
+    println!("\n### Latency at {rate_hz} pairs a second, 1280 × 960, 1,000 keypoints an image\n");
+    println!("| median ms | p99 ms | slowest ms | pairs a second |");
+    println!("|---:|---:|---:|---:|");
+    let recording = Recording::simulated(thesis_rig(), FRAMES);
+    let source = Rate(recording.source(WARM_UP + 400), rate_hz);
+    let run = Run::over(&recording.rig, Realtime::new(source), 1000, 2, |_| ());
+    let at = |share: f64| run.quantile_ms(|l| l.total, share);
+    println!(
+        "| {:.1} | {:.1} | {:.1} | {:.1} |",
+        at(0.5),
+        at(0.99),
+        at(1.0),
+        1e3 / run.wall_ms
+    );
+}
