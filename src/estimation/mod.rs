@@ -66,7 +66,8 @@ pub struct Counts {
     pub keypoints_right: u32,
     /// Left–right matches.
     pub stereo_matches: u32,
-    /// Stereo matches found again from the pair before.
+    /// What was seen before and is found again: stereo matches of the pair before, or landmarks of the
+    /// window.
     pub tracks: u32,
     /// Tracks that the estimate rests on.
     pub inliers: u32,

@@ -150,8 +150,11 @@ impl Detector {
         candidates.clear();
         let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
         let beside = [layer - 1, layer + 1].map(|beside| {
-            let is_held = self.is_held(beside);
-            is_held.then(|| self.row(beside, centre)).unwrap_or(near[0])
+            if self.is_held(beside) {
+                self.row(beside, centre)
+            } else {
+                near[0]
+            }
         });
         let rows = [near[0], near[1], near[2], beside[0], beside[1]];
         find_candidates(&rows, threshold, columns, &mut marks, &mut candidates);
@@ -219,9 +222,9 @@ impl Detector {
 
     /// Copies the samples around one of an inner layer.
     fn held(&self, layer: usize, row: usize, column: usize, values: &mut Layer) {
-        for n in 0..3 {
+        for (n, values) in values.iter_mut().enumerate() {
             let start = self.start(layer, row + n - 1) + column - 1;
-            values[n].copy_from_slice(&self.determinants[start..start + 3]);
+            values.copy_from_slice(&self.determinants[start..start + 3]);
         }
     }
 

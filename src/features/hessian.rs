@@ -159,12 +159,7 @@ impl Filter {
     fn corners(&self, row: usize, column: usize) -> [[usize; 10]; 2] {
         let top = (row - self.margin()) * self.step_px;
         let left = (column - self.margin()) * self.step_px;
-        let mut corners = [[0; 10]; 2];
-        for n in 0..10 {
-            corners[0][n] = top + self.ninth_px[n];
-            corners[1][n] = left + self.ninth_px[n];
-        }
-        corners
+        [top, left].map(|from| self.ninth_px.map(|ninth_px| from + ninth_px))
     }
 
     /// The determinant from the sums over the boxes.

@@ -149,6 +149,10 @@ struct Job {
 }
 
 /// What comes back: tickets count the source's events.
+#[expect(
+    clippy::large_enum_variant,
+    reason = "a queue of few; boxes would be allocated for every image"
+)]
 enum Done {
     Side {
         job: Job,

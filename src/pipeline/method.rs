@@ -92,7 +92,7 @@ pub(super) struct Workbench {
 }
 
 enum Estimator {
-    TwoFrame(TwoFrame),
+    TwoFrame(Box<TwoFrame>),
     Window(Box<Windowed>),
 }
 
@@ -117,7 +117,7 @@ impl Method {
             estimation::Method::Window => {
                 Estimator::Window(Box::new(Windowed::new(&rig, &estimation)))
             }
-            _ => Estimator::TwoFrame(TwoFrame::default()),
+            _ => Estimator::TwoFrame(Box::default()),
         };
         let bench = Workbench {
             rig,

@@ -32,6 +32,8 @@ pub(super) struct Windowed {
     gallery: Gallery,
     /// The left images of keyframes, by serial.
     images: Vec<(u64, Pyramid)>,
+    /// Images that no keyframe needs any more.
+    spare_images: Vec<Pyramid>,
     next_id: u64,
     seen: Vec<window::Seen>,
     weights: Vec<f64>,
@@ -49,6 +51,7 @@ impl Windowed {
             window: Window::new(rig.clone(), settings.clone()),
             gallery: Gallery::default(),
             images: Vec::new(),
+            spare_images: Vec::new(),
             next_id: 0,
             seen: Vec::new(),
             weights: Vec::new(),
@@ -97,7 +100,8 @@ impl Windowed {
             return self.bridge(bench, odometer, stamp);
         };
         self.window.settle();
-        let counts = bench.counts(tracked.inliers);
+        let mut counts = bench.counts(tracked.inliers);
+        counts.tracks = self.seen.len() as u32;
         let row = odometer.arrive(stamp, &tracked, counts);
         if self.wants_keyframe(bench) {
             self.promote(bench);
@@ -110,7 +114,8 @@ impl Windowed {
         let (odom_from_now, cov) = odometer.last_place();
         self.window.begin_at(&odom_from_now, &cov);
         self.gallery.clear();
-        self.images.clear();
+        let images = self.images.drain(..).map(|(_, image)| image);
+        self.spare_images.extend(images);
         self.is_known.clear();
         self.is_known.resize(bench.now.matches.len(), false);
         self.promote(bench);
@@ -429,7 +434,10 @@ impl Windowed {
             .images
             .iter()
             .position(|(serial, _)| window.keyframe_serials().all(|s| s != *serial));
-        gone.map_or_else(Pyramid::default, |at| self.images.remove(at).1)
+        match gone {
+            Some(at) => self.images.remove(at).1,
+            None => self.spare_images.pop().unwrap_or_default(),
+        }
     }
 }
 

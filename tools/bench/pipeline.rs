@@ -221,7 +221,7 @@ fn endurance(pairs: u64) {
     let lap = (pairs / 10).max(1) as usize;
     let mut start = process_time();
     let see = |counted: usize| {
-        if counted % lap == 0 {
+        if counted.is_multiple_of(lap) {
             let cpu_ms = ms(process_time() - start) / lap as f64;
             println!("| {counted} | {cpu_ms:.2} | {:.1} |", memory_mb("VmRSS"));
             start = process_time();

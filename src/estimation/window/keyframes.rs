@@ -1,5 +1,6 @@
 //! Keyframes: which frames stay in the window, and how the oldest leaves it.
 
+use super::system::At;
 use super::{Landmark, Seen, Window, row_of};
 use crate::geometry::se3;
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, MatrixXx6, Vector6};
@@ -96,16 +97,15 @@ impl Window {
             .iter()
             .enumerate()
             .filter(|(_, l)| l.anchor == oldest);
-        let variance = self.variance.smoothed;
-        system.build(
-            &self.rig,
-            &self.warp,
-            &self.frames,
-            leaving,
-            Some(newest),
-            variance,
-            0.0,
-        );
+        let at = At {
+            rig: &self.rig,
+            warp: &self.warp,
+            frames: &self.frames,
+            without: Some(newest),
+            variance_factor: self.variance.smoothed,
+            damping: 0.0,
+        };
+        system.build(&at, leaving);
         let (mut hessian, mut gradient) = system.assemble();
         self.system = system;
         // From "at the current poses" to "counted from where they are linearised".

@@ -5,10 +5,11 @@ use super::super::consensus::{self, Search, Sighting};
 use super::super::sight;
 use super::datum::Datum;
 use super::prior::Prior;
+use super::system::{At, System};
 use super::warp::{WARP, Warp};
 use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
 use crate::geometry::se3;
-use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector3, Vector6};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, Vector3, Vector6};
 
 /// A frame's motion that many of its sights agree on, before adjustment.
 #[derive(Clone, Debug)]
@@ -19,6 +20,16 @@ pub struct Consent {
     pub inliers: Vec<u32>,
 }
 
+/// What a step that proves to be bad is taken back to.
+struct State {
+    cost: f64,
+    warp: Warp,
+    frames: Vec<Frame>,
+    points: Vec<Vector3<f64>>,
+}
+
+/// Damping beyond which no step will help.
+const MAX_DAMPING: f64 = 1e3;
 /// Iterations of Levenberg and Marquardt at most.
 const MAX_ITERATIONS: usize = 12;
 /// The gain in cost, σ², that a step must promise to be worth taking: a hundredth of the σ of any
@@ -170,45 +181,23 @@ impl Window {
         Some(self.tracked(&joint, variance_factor, inliers))
     }
 
-    /// Levenberg–Marquardt over poses and landmarks; the joint covariance of the poses at the
-    /// optimum.
+    /// Levenberg–Marquardt over warp, poses and landmarks; the joint covariance of warp and poses at
+    /// the optimum.
     fn solve(&mut self) -> Option<Joint> {
-        let variance = self.variance.smoothed;
-        let mut damping = 0.0;
         let mut system = std::mem::take(&mut self.system);
-        let mut kept: Option<(Warp, Vec<Frame>, Vec<Vector3<f64>>, f64)> = None;
-        let mut result = None;
+        let mut damping = 0.0;
+        let mut kept: Option<State> = None;
+        let mut joint = None;
         for _ in 0..MAX_ITERATIONS {
-            let landmarks = self.landmarks.iter().enumerate();
-            let mut cost = system.build(
-                &self.rig,
-                &self.warp,
-                &self.frames,
-                landmarks,
-                None,
-                variance,
-                damping,
-            );
-            let (mut hessian, mut gradient) = system.assemble();
-            cost += self
-                .prior
-                .add_to(&self.warp, &self.frames, &mut hessian, &mut gradient);
-            if let Some((warp, frames, points, before)) = &kept
-                && cost > before + 1e-9 * before.abs()
-            {
-                self.warp.clone_from(warp);
-                self.frames.clone_from(frames);
-                for (landmark, point) in self.landmarks.iter_mut().zip(points) {
-                    landmark.inverse_depth = *point;
-                }
+            let (mut hessian, gradient, cost) = self.equations(&mut system, damping);
+            if let Some(before) = kept.take_if(|k| cost > k.cost + 1e-9 * k.cost.abs()) {
+                self.restore(before);
                 damping = if damping == 0.0 { 1e-4 } else { damping * 10.0 };
-                if damping > 1e3 {
+                if damping > MAX_DAMPING {
                     break;
                 }
-                kept = None;
                 continue;
             }
-            let undamped = damping == 0.0;
             for i in 0..hessian.nrows() {
                 hessian[(i, i)] *= 1.0 + damping;
             }
@@ -219,26 +208,54 @@ impl Window {
             if step.iter().any(|v| !v.is_finite()) {
                 break;
             }
-            let gain = 0.5 * step.dot(&gradient);
-            if undamped && gain < MIN_GAIN {
+            joint = Some(cholesky.inverse());
+            if damping == 0.0 && 0.5 * step.dot(&gradient) < MIN_GAIN {
                 // The landmarks' own covariances are still due.
                 system.move_landmarks(&DVector::zeros(step.len()), &mut self.landmarks);
-                result = Some(cholesky.inverse());
                 break;
             }
-            kept = Some((
-                self.warp.clone(),
-                self.frames.clone(),
-                self.landmarks.iter().map(|l| l.inverse_depth).collect(),
-                cost,
-            ));
+            kept = Some(self.state(cost));
             self.move_frames(&step);
             system.move_landmarks(&step, &mut self.landmarks);
             damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
-            result = Some(cholesky.inverse());
         }
         self.system = system;
-        result
+        joint
+    }
+
+    /// The equations at the present state, the prior included, and the cost.
+    fn equations(&self, system: &mut System, damping: f64) -> (DMatrix<f64>, DVector<f64>, f64) {
+        let at = At {
+            rig: &self.rig,
+            warp: &self.warp,
+            frames: &self.frames,
+            without: None,
+            variance_factor: self.variance.smoothed,
+            damping,
+        };
+        let cost = system.build(&at, self.landmarks.iter().enumerate());
+        let (mut hessian, mut gradient) = system.assemble();
+        let of_prior = self
+            .prior
+            .add_to(&self.warp, &self.frames, &mut hessian, &mut gradient);
+        (hessian, gradient, cost + of_prior)
+    }
+
+    fn state(&self, cost: f64) -> State {
+        State {
+            cost,
+            warp: self.warp.clone(),
+            frames: self.frames.clone(),
+            points: self.landmarks.iter().map(|l| l.inverse_depth).collect(),
+        }
+    }
+
+    fn restore(&mut self, state: State) {
+        self.warp = state.warp;
+        self.frames = state.frames;
+        for (landmark, point) in self.landmarks.iter_mut().zip(&state.points) {
+            landmark.inverse_depth = *point;
+        }
     }
 
     fn move_frames(&mut self, step: &DVector<f64>) {

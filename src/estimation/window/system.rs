@@ -14,6 +14,20 @@ use nalgebra::{
     Vector6,
 };
 
+/// Where and how observations are linearised.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct At<'a> {
+    pub(super) rig: &'a StereoRig,
+    pub(super) warp: &'a Warp,
+    pub(super) frames: &'a [Frame],
+    /// A frame whose observations are left out.
+    pub(super) without: Option<u64>,
+    /// Information is divided by it.
+    pub(super) variance_factor: f64,
+    /// Levenberg's and Marquardt's.
+    pub(super) damping: f64,
+}
+
 /// Normal equations, with the working memory for making them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct System {
@@ -60,36 +74,19 @@ struct Cross {
 }
 
 impl System {
-    /// Linearises the observations of `landmarks` that lie in `frames`, but those of frame
-    /// `without`; information is divided by `variance_factor`. Returns the robust cost, in σ².
+    /// Linearises the observations of `landmarks`. Returns the robust cost, in σ².
     pub(super) fn build<'a>(
         &mut self,
-        rig: &StereoRig,
-        warp: &Warp,
-        frames: &[Frame],
+        at: &At<'_>,
         landmarks: impl Iterator<Item = (usize, &'a Landmark)>,
-        without: Option<u64>,
-        variance_factor: f64,
-        damping: f64,
     ) -> f64 {
-        self.begin(frames);
+        self.begin(at.frames);
         let mut cost = 0.0;
         for (index, landmark) in landmarks {
-            cost += self
-                .eliminate(
-                    rig,
-                    warp,
-                    frames,
-                    index,
-                    landmark,
-                    without,
-                    variance_factor,
-                    damping,
-                )
-                .unwrap_or(0.0);
+            cost += self.eliminate(at, index, landmark).unwrap_or(0.0);
         }
         self.expand_sightlines();
-        cost / variance_factor
+        cost / at.variance_factor
     }
 
     fn begin(&mut self, frames: &[Frame]) {
@@ -128,21 +125,8 @@ impl System {
 
     /// Adds a landmark's observations and eliminates its point. `None` if it has fewer than two or
     /// cannot be seen from where it was observed.
-    #[expect(
-        clippy::too_many_arguments,
-        reason = "one call site; a struct would only rename them"
-    )]
-    fn eliminate(
-        &mut self,
-        rig: &StereoRig,
-        warp: &Warp,
-        frames: &[Frame],
-        index: usize,
-        landmark: &Landmark,
-        without: Option<u64>,
-        variance_factor: f64,
-        damping: f64,
-    ) -> Option<f64> {
+    fn eliminate(&mut self, at: &At<'_>, index: usize, landmark: &Landmark) -> Option<f64> {
+        let (rig, warp, frames) = (at.rig, at.warp, at.frames);
         let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
         let mut point_point = Matrix3::zeros();
         let mut point_gradient = Vector3::zeros();
@@ -154,15 +138,15 @@ impl System {
         let mut anchor_by_point = SMatrix::<f64, 6, 3>::zeros();
         let mut sights = 0;
         for observation in &landmark.observations {
-            if Some(observation.serial) == without {
+            if Some(observation.serial) == at.without {
                 continue;
             }
             let Some(frame) = frames.iter().position(|f| f.serial == observation.serial) else {
                 continue;
             };
             let line = &mut self.sightlines[anchor * self.frame_count + frame];
-            let at = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
-            let Some(mut seen) = sight::linearise(rig, at, &landmark.inverse_depth) else {
+            let from = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
+            let Some(mut seen) = sight::linearise(rig, from, &landmark.inverse_depth) else {
                 continue;
             };
             if line.linearised.is_some() {
@@ -177,7 +161,7 @@ impl System {
             let (info, residual, loss) = weigh(
                 &(warp.corrected(&observation.measurement).px - seen.px),
                 &observation.measurement.sigma_px,
-                variance_factor,
+                at.variance_factor,
             );
             cost += loss;
             let weighted = seen.by_point.transpose() * info;
@@ -210,7 +194,7 @@ impl System {
             by_point: anchor_by_point,
         });
         for i in 0..3 {
-            point_point[(i, i)] *= 1.0 + damping;
+            point_point[(i, i)] *= 1.0 + at.damping;
         }
         let cov = point_point.cholesky()?.inverse();
         let crosses = first_cross..self.crosses.len();

@@ -6,98 +6,196 @@ use crate::simulation::{self, points};
 use crate::uncertainty::consistency;
 use nalgebra::{Vector4, Vector6};
 
+/// One run's errors over their covariances.
 struct Run {
     nees_pose: f64,
     nees_motion: Vec<f64>,
-    error: Vector6<f64>,
+    warp_px: f64,
+    sigma_warp_px: f64,
 }
 
-fn sigma(px: Vector4<f64>, sigma_px: f64) -> StereoMeasurement {
-    StereoMeasurement {
-        px,
-        sigma_px: Vector4::repeat(sigma_px),
-    }
+const SIGMA_PX: f64 = 0.5;
+
+fn sights(frame: &points::PointFrame, displaced_px: f64) -> Vec<Seen> {
+    let seen = |s: &points::Sight| Seen {
+        id: s.id,
+        measurement: StereoMeasurement {
+            px: s.pixels + Vector4::new(0.0, 0.0, displaced_px, 0.0),
+            sigma_px: Vector4::repeat(SIGMA_PX),
+        },
+    };
+    frame.sights.iter().map(seen).collect()
 }
 
-/// Drives along a gentle curve; every frame is a keyframe.
-fn drive(steps: usize, survival: f64, seed: u64) -> Run {
+fn step() -> Isometry3<f64> {
+    se3::exp(&Vector6::new(0.01, 0.0, 0.2, 0.0, 0.01, 0.002))
+}
+
+/// Drives along a gentle curve with a right image that is displaced; every frame is a keyframe.
+fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, seed: u64) -> Run {
     let rig = simulation::thesis_rig();
-    let settings = points::Settings {
+    let world = points::Settings {
         landmarks: 80,
         survival,
         ..points::Settings::default()
     };
-    let mut simulation = points::PointSimulation::new(rig.clone(), settings, seed).expect("valid");
+    let mut simulation = points::PointSimulation::new(rig.clone(), world, seed).expect("valid");
     let mut frame = points::PointFrame::default();
-    let tiny = Matrix6::identity() * 1e-12;
-    let estimation = Settings {
-        good_inliers: 10,
-        ..Settings::default()
-    };
-    let mut window = Window::new(rig, estimation);
-    let step = se3::exp(&Vector6::new(0.01, 0.0, 0.2, 0.0, 0.01, 0.002));
+    let mut window = Window::new(rig, settings.clone());
     let mut truth = Isometry3::identity();
     let mut run = Run {
         nees_pose: 0.0,
         nees_motion: Vec::new(),
-        error: Vector6::zeros(),
+        warp_px: 0.0,
+        sigma_warp_px: 0.0,
     };
     let nees = |error: &Vector6<f64>, cov: &Matrix6<f64>| {
         consistency::nees(error, cov).expect("positive definite")
     };
-    for k in 0..=steps {
+    simulation.observe(&truth, &mut frame);
+    window.begin_at(&truth, &(Matrix6::identity() * 1e-16));
+    window.promote(&sights(&frame, displaced_px));
+    for k in 1..=steps {
+        truth *= step();
         simulation.observe(&truth, &mut frame);
-        let sights: Vec<Seen> = frame
-            .sights
+        let (known, new): (Vec<Seen>, Vec<Seen>) = sights(&frame, displaced_px)
             .iter()
-            .map(|s| Seen {
-                id: s.id,
-                measurement: sigma(s.pixels, 0.5),
-            })
-            .collect();
-        if k == 0 {
-            window.begin_at(&Isometry3::identity(), &tiny);
-            window.promote(&sights);
-        } else {
-            let (known, new): (Vec<Seen>, Vec<Seen>) =
-                sights.iter().partition(|s| window.landmark(s.id).is_some());
-            let consent = window
-                .consent(&known, &vec![1.0; known.len()], &step, k as u64)
-                .expect("agrees");
-            let agreed: Vec<Seen> = consent.inliers.iter().map(|&i| known[i as usize]).collect();
-            window.add(&consent.newest_from_now, &agreed);
-            let tracked = window.adjust().expect("determined");
-            let error = se3::log(&(truth.inverse() * tracked.odom_from_now));
-            run.nees_pose = nees(&error, &tracked.cov_pose_right);
-            run.error = error;
-            run.nees_motion.push(nees(
-                &se3::log(&(step.inverse() * tracked.motion.prev_from_now)),
-                &tracked.motion.cov_right,
-            ));
-            window.settle();
-            window.promote(&new);
-        }
-        truth *= step;
+            .partition(|s| window.landmark(s.id).is_some());
+        let weights = vec![1.0; known.len()];
+        let consent = window
+            .consent(&known, &weights, &step(), k as u64)
+            .expect("agrees");
+        let agreed: Vec<Seen> = consent.inliers.iter().map(|&i| known[i as usize]).collect();
+        window.add(&consent.newest_from_now, &agreed);
+        let tracked = window.adjust().expect("determined");
+        let motion_error = se3::log(&(step().inverse() * tracked.motion.prev_from_now));
+        run.nees_motion
+            .push(nees(&motion_error, &tracked.motion.cov_right));
+        let pose_error = se3::log(&(truth.inverse() * tracked.odom_from_now));
+        run.nees_pose = nees(&pose_error, &tracked.cov_pose_right);
+        window.settle();
+        window.promote(&new);
     }
+    // Along the baseline, which points to the left.
+    run.warp_px = -window.warp_px()[0];
+    run.sigma_warp_px = window.sigma_warp_px()[0];
     run
 }
 
-#[test]
-fn pose_and_motion_covariances_hold() {
-    for survival in [0.5, 0.8, 0.9, 0.97] {
-        let runs: Vec<Run> = (0..40).map(|seed| drive(30, survival, seed)).collect();
-        let pose: f64 = runs.iter().map(|r| r.nees_pose).sum::<f64>() / 6.0 / runs.len() as f64;
-        let motions: Vec<f64> = runs
-            .iter()
-            .flat_map(|r| r.nees_motion.iter().copied())
-            .collect();
-        let motion = motions.iter().sum::<f64>() / 6.0 / motions.len() as f64;
-        let t = (runs
-            .iter()
-            .map(|r| r.error.xyz().norm_squared())
-            .sum::<f64>()
-            / runs.len() as f64)
-            .sqrt();
-        println!("survival {survival}: pose {pose:.3} motion {motion:.3} rms {t:.5} m");
+fn exact() -> Settings {
+    Settings {
+        calibration_sigma_px: 0.0,
+        ..Settings::default()
     }
+}
+
+/// The averages over runs of the pose's and of the motions' NEES, over six.
+fn anees(runs: &[Run]) -> (f64, f64) {
+    let pose = runs.iter().map(|r| r.nees_pose).sum::<f64>() / (6 * runs.len()) as f64;
+    let motions: Vec<f64> = runs.iter().flat_map(|r| r.nees_motion.clone()).collect();
+    (
+        pose,
+        motions.iter().sum::<f64>() / (6 * motions.len()) as f64,
+    )
+}
+
+#[test]
+fn covariances_of_pose_and_motion_hold_whatever_the_length_of_tracks() {
+    const RUNS: u64 = 60;
+    for survival in [0.5, 0.9] {
+        let runs: Vec<Run> = (0..RUNS)
+            .map(|seed| drive(30, survival, 0.0, &exact(), seed))
+            .collect();
+        let (pose, motion) = anees(&runs);
+        // χ²(360)/360: 99.7 % lie within 1 ± 0.22; the motions' share their landmarks.
+        let (low, high) = consistency::anees_interval(6, RUNS as usize, 0.997);
+        assert!((low..high).contains(&pose), "survival {survival}: {pose}");
+        assert!(
+            (0.94..1.06).contains(&motion),
+            "survival {survival}: {motion}"
+        );
+    }
+}
+
+#[test]
+fn a_displaced_right_image_is_found_and_the_pose_covers_it() {
+    const RUNS: u64 = 40;
+    // As far off as the settings suppose; each run has its own.
+    let supposed = Settings::default();
+    let sigma_px = supposed.calibration_sigma_px;
+    let runs: Vec<(f64, Run)> = (0..RUNS)
+        .map(|seed| {
+            let displaced_px = sigma_px * (2.0 * seed as f64 / (RUNS - 1) as f64 - 1.0);
+            (displaced_px, drive(30, 0.9, displaced_px, &supposed, seed))
+        })
+        .collect();
+    let mut squares = 0.0;
+    for (displaced_px, run) in &runs {
+        assert!(run.sigma_warp_px < 0.5 * sigma_px, "{}", run.sigma_warp_px);
+        let error = run.warp_px - displaced_px;
+        squares += (error / run.sigma_warp_px).powi(2) / RUNS as f64;
+    }
+    // χ²(40)/40: 99.7 % lie within [0.43, 1.82].
+    assert!((0.43..1.82).contains(&squares), "{squares}");
+    let runs: Vec<Run> = runs.into_iter().map(|(_, run)| run).collect();
+    let (pose, motion) = anees(&runs);
+    let (low, high) = consistency::anees_interval(6, RUNS as usize, 0.997);
+    assert!((low..high).contains(&pose), "{pose}");
+    assert!((0.9..1.1).contains(&motion), "{motion}");
+}
+
+#[test]
+fn nothing_is_lost_of_precision_over_many_keyframes() {
+    let run = drive(300, 0.8, 0.0, &exact(), 7);
+    let motion = run.nees_motion.iter().sum::<f64>() / (6 * run.nees_motion.len()) as f64;
+    let late = &run.nees_motion[200..];
+    let late = late.iter().sum::<f64>() / (6 * late.len()) as f64;
+    assert!((0.85..1.15).contains(&motion), "{motion}");
+    assert!((0.75..1.25).contains(&late), "{late}");
+}
+
+#[test]
+fn a_standing_robot_neither_drifts_nor_grows_its_covariance() {
+    let rig = simulation::thesis_rig();
+    let world = points::Settings {
+        landmarks: 80,
+        survival: 1.0,
+        ..points::Settings::default()
+    };
+    let mut simulation = points::PointSimulation::new(rig.clone(), world, 3).expect("valid");
+    let mut frame = points::PointFrame::default();
+    let mut window = Window::new(rig, exact());
+    let still = Isometry3::identity();
+    simulation.observe(&still, &mut frame);
+    window.begin_at(&still, &(Matrix6::identity() * 1e-16));
+    window.promote(&sights(&frame, 0.0));
+    let mut first_cov = None;
+    for k in 1..=60 {
+        simulation.observe(&still, &mut frame);
+        let seen = sights(&frame, 0.0);
+        window.add(&still, &seen);
+        let tracked = window.adjust().expect("determined");
+        window.settle();
+        let sigma_m = tracked.cov_pose_right[(2, 2)].sqrt();
+        let first = *first_cov.get_or_insert(sigma_m);
+        assert!(sigma_m < 1.3 * first, "pair {k}: {sigma_m} after {first}");
+        assert!(
+            tracked.odom_from_now.translation.z.abs() < 5.0 * sigma_m,
+            "pair {k}: {}",
+            tracked.odom_from_now
+        );
+    }
+}
+
+#[test]
+fn what_cannot_be_adjusted_leaves_the_window_as_it_was() {
+    let rig = simulation::thesis_rig();
+    let mut window = Window::new(rig, exact());
+    window.begin_at(&Isometry3::identity(), &(Matrix6::identity() * 1e-12));
+    window.promote(&[]);
+    let before = window.newest_serial();
+    window.add(&step(), &[]);
+    assert!(window.adjust().is_none());
+    assert_eq!(window.newest_serial(), before);
+    assert!(window.consent(&[], &[], &step(), 1).is_none());
 }
