@@ -80,8 +80,8 @@ mod tests {
     }
 
     const FRAMES: u64 = 8;
-    /// To and fro twice: every buffer has been as large as any pair makes it.
-    const WARM_UP: u64 = 4 * FRAMES;
+    /// To and fro four times: every buffer has been as large as any pair makes it.
+    const WARM_UP: u64 = 8 * FRAMES;
     const COUNTED: u64 = 4 * FRAMES;
 
     #[test]

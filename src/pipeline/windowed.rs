@@ -8,6 +8,7 @@ use super::occupancy::Occupancy;
 use crate::estimation::window::{self, Consent, Window};
 use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings, StereoMeasurement};
 use crate::geometry::StereoRig;
+use crate::image::GrayImage;
 use crate::matching::MatchError;
 use crate::refinement::{self, Appearance, Pyramid};
 use nalgebra::{Isometry3, Vector4};
@@ -47,11 +48,14 @@ pub(super) struct Windowed {
 
 impl Windowed {
     pub(super) fn new(rig: &StereoRig, settings: &Settings) -> Self {
+        // As many as the window will ever hold, so that none has to be allocated on the way.
+        let mut blank = Pyramid::default();
+        blank.fill(&GrayImage::filled(rig.left.width, rig.left.height, 0));
         Self {
             window: Window::new(rig.clone(), settings.clone()),
             gallery: Gallery::default(),
             images: Vec::new(),
-            spare_images: Vec::new(),
+            spare_images: vec![blank; settings.keyframes as usize + 1],
             next_id: 0,
             seen: Vec::new(),
             weights: Vec::new(),
