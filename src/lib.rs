@@ -27,6 +27,7 @@ pub mod matching;
 pub mod montecarlo;
 pub mod output;
 pub mod pipeline;
+mod queue;
 pub mod refinement;
 pub mod settings;
 mod simd;

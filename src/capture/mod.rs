@@ -105,6 +105,14 @@ pub trait PairSource: Send {
         None
     }
 
+    /// Says before the first event how many pairs the consumer will hold at once, so that memory for
+    /// them is taken now rather than when there are as many for the first time.
+    ///
+    /// Nobody has to call it; a source without a pool has no use for it.
+    fn make_room(&mut self, pairs_held: usize) {
+        let _ = pairs_held;
+    }
+
     /// Takes back a pair that is done with, so that its buffers can be filled again.
     ///
     /// Nobody has to call it; a source without a pool drops the pair.

@@ -57,6 +57,10 @@ impl<S: PairSource> PairSource for Realtime<S> {
         self.source.len_hint()
     }
 
+    fn make_room(&mut self, pairs_held: usize) {
+        self.source.make_room(pairs_held);
+    }
+
     fn recycle(&mut self, pair: StereoPair) {
         self.source.recycle(pair);
     }

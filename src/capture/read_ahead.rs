@@ -1,16 +1,17 @@
 //! A recording's files in; decoded pairs out, in order, made ready ahead of the consumer.
 //!
 //! One thread a side decodes into its own bounded queue; the consumer takes one image from each.
-//! Buffers given back by [`recycle`](PairSource::recycle) are filled again.
+//! As many buffers as can be under way are there from the beginning; those given back by
+//! [`recycle`](PairSource::recycle) are filled again.
 
 use super::dataset::{Dataset, ImageFiles, PairFiles};
 use super::decode::Decoder;
 use super::{PairEvent, PairSource, StereoPair, Unusable};
 use crate::image::GrayImage;
-use crossbeam_channel::{Receiver, Sender, bounded};
+use crate::queue::{Receiver, bounded};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::Arc;
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 
 /// One side's answer to one pair: the image, or a sentence why there is none.
@@ -40,6 +41,7 @@ impl ReadAhead {
                 SideReader::start(
                     name,
                     dataset.settings.read_ahead,
+                    (width, height),
                     Arc::clone(&pairs),
                     pick,
                     move |file, image| {
@@ -113,6 +115,11 @@ impl PairSource for ReadAhead {
         Some(self.pairs.len() as u64)
     }
 
+    fn make_room(&mut self, pairs_held: usize) {
+        self.left.make_room(pairs_held);
+        self.right.make_room(pairs_held);
+    }
+
     fn recycle(&mut self, pair: StereoPair) {
         self.left.give_back(pair.left);
         self.right.give_back(pair.right);
@@ -124,53 +131,118 @@ impl PairSource for ReadAhead {
 struct SideReader {
     /// `None` once the side is being dropped, which is what stops the thread.
     decoded: Option<Receiver<Decoded>>,
-    spare: Sender<GrayImage>,
+    depth: usize,
+    pool: Arc<Pool>,
     thread: Option<JoinHandle<()>>,
 }
 
 impl SideReader {
-    /// `pick` chooses this side's file of a pair; `decode` fills an image from it.
+    /// `pick` chooses this side's file of a pair; `decode` fills an image of `size_px` from it.
     fn start(
         name: &str,
         depth: usize,
+        size_px: (u32, u32),
         pairs: Arc<[PairFiles]>,
         pick: fn(&ImageFiles) -> Option<&PathBuf>,
         mut decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
     ) -> std::io::Result<Self> {
         let (to_consumer, decoded) = bounded(depth);
-        // As many as can be under way: in the queue, with the consumer and in the decoder.
-        let (spare, spares) = bounded::<GrayImage>(depth + 2);
+        let pool = Arc::new(Pool::new(size_px));
+        let spares = Arc::clone(&pool);
+        let mut side = Self {
+            decoded: Some(decoded),
+            depth,
+            pool,
+            thread: None,
+        };
+        side.make_room(1);
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
             .spawn(move || {
                 for file in pairs.iter().filter_map(|pair| pick(&pair.images)) {
-                    let image = spares.try_recv().unwrap_or_default();
-                    let answer = decode_safely(&mut decode, file, image);
+                    let mut image = spares.take();
+                    let answer = match decode_safely(&mut decode, file, &mut image) {
+                        Ok(()) => Ok(image),
+                        Err(why) => {
+                            spares.give_back(image);
+                            Err(why)
+                        }
+                    };
                     if to_consumer.send(answer).is_err() {
                         return;
                     }
                 }
             })?;
-        Ok(Self {
-            decoded: Some(decoded),
-            spare,
-            thread: Some(thread),
-        })
+        side.thread = Some(thread);
+        Ok(side)
+    }
+
+    /// Has as many images as can be under way: in the queue, in the decoder and with the consumer.
+    fn make_room(&self, held: usize) {
+        self.pool.grow(self.depth + 1 + held);
     }
 
     /// The next image. A thread that has died is an answer, too: nobody waits for it.
     fn take(&self) -> Decoded {
         let gone = || "the thread that decodes images has ended".to_owned();
-        self.decoded
-            .as_ref()
-            .ok_or_else(gone)?
-            .recv()
-            .map_err(|_| gone())?
+        let decoded = self.decoded.as_ref().ok_or_else(gone)?;
+        decoded.recv().ok_or_else(gone)?
     }
 
     fn give_back(&self, image: GrayImage) {
-        // A full pool has no use for one more.
-        let _ = self.spare.try_send(image);
+        self.pool.give_back(image);
+    }
+}
+
+/// Images that wait to be filled.
+#[derive(Debug)]
+struct Pool {
+    size_px: (u32, u32),
+    spare: Mutex<Spare>,
+}
+
+#[derive(Debug, Default)]
+struct Spare {
+    images: Vec<GrayImage>,
+    /// Images that there are, here or under way.
+    all: usize,
+}
+
+impl Pool {
+    fn new(size_px: (u32, u32)) -> Self {
+        Self {
+            size_px,
+            spare: Mutex::default(),
+        }
+    }
+
+    /// Adds images until there are `count` in all.
+    fn grow(&self, count: usize) {
+        let mut spare = self.lock();
+        spare.images.reserve(count);
+        while spare.all < count {
+            let (width, height) = self.size_px;
+            spare.images.push(GrayImage::filled(width, height, 0));
+            spare.all += 1;
+        }
+    }
+
+    /// A spare image, or a new one for a consumer that holds more than it said.
+    fn take(&self) -> GrayImage {
+        self.lock().images.pop().unwrap_or_default()
+    }
+
+    /// Keeps an image unless there are enough without it.
+    fn give_back(&self, image: GrayImage) {
+        let mut spare = self.lock();
+        if spare.images.len() < spare.all {
+            spare.images.push(image);
+        }
+    }
+
+    fn lock(&self) -> MutexGuard<'_, Spare> {
+        // Nothing panics while it holds the lock.
+        self.spare.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -178,12 +250,11 @@ impl SideReader {
 fn decode_safely(
     decode: &mut impl FnMut(&Path, &mut GrayImage) -> Result<(), String>,
     file: &Path,
-    mut image: GrayImage,
-) -> Decoded {
+    image: &mut GrayImage,
+) -> Result<(), String> {
     // Unwind safe: all that a panic leaves half done are buffers, which each call fills anew.
-    match catch_unwind(AssertUnwindSafe(|| decode(file, &mut image))) {
-        Ok(Ok(())) => Ok(image),
-        Ok(Err(why)) => Err(why),
+    match catch_unwind(AssertUnwindSafe(|| decode(file, image))) {
+        Ok(answer) => answer,
         Err(_) => Err(format!("{}: the decoder failed on it", file.display())),
     }
 }
@@ -217,7 +288,7 @@ mod tests {
     fn side(
         decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
     ) -> SideReader {
-        SideReader::start("test", 2, pairs(6), left_of, decode).expect("a thread")
+        SideReader::start("test", 2, (64, 64), pairs(6), left_of, decode).expect("a thread")
     }
 
     #[test]
@@ -254,18 +325,37 @@ mod tests {
     }
 
     #[test]
+    fn as_many_images_as_can_be_under_way_are_there_at_the_start() {
+        let side = side(|_, _| Ok(()));
+        side.make_room(3);
+        // Two in the queue, one in the decoder, three that are held: a new one would be empty.
+        let held: Vec<_> = (0..6).map(|_| side.take()).collect();
+        let is_of_the_pool = |answer: &Decoded| answer.as_ref().is_ok_and(|i| i.width() == 64);
+        assert!(held.iter().all(is_of_the_pool));
+        assert_eq!(side.pool.lock().images.len(), 0);
+    }
+
+    #[test]
+    fn a_file_that_cannot_be_read_costs_no_image() {
+        let side = side(|_, _| Err("unreadable".to_owned()));
+        for _ in 0..6 {
+            assert_eq!(side.take(), Err("unreadable".to_owned()));
+        }
+        assert!(side.take().is_err(), "after the end");
+        assert_eq!(side.pool.lock().images.len(), 4);
+    }
+
+    #[test]
     fn one_that_is_dropped_early_ends_its_thread() {
-        let (ended, end) = bounded::<()>(0);
+        let witness = Arc::new(());
+        let held = Arc::clone(&witness);
         let side = side(move |_, _| {
-            // Disconnected when the closure is dropped, that is when the thread is over.
-            let _ = &ended;
+            // Dropped with the closure, that is when the thread is over.
+            let _ = &held;
             Ok(())
         });
         drop(side.take());
         drop(side);
-        assert_eq!(
-            end.try_recv(),
-            Err(crossbeam_channel::TryRecvError::Disconnected)
-        );
+        assert_eq!(Arc::strong_count(&witness), 1);
     }
 }

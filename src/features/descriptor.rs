@@ -48,6 +48,11 @@ impl Describer {
         }
     }
 
+    /// Makes room for images of this size and keypoints up to `size_px`.
+    pub(super) fn make_room(&mut self, image: &GrayImage, size_px: f32) {
+        self.patch.make_room(image, size_px);
+    }
+
     /// Prepares for another image.
     pub(super) fn begin(&mut self) {
         self.patch.begin();

@@ -10,9 +10,9 @@
 //! sample of the layer beside them is the highest so far, and nowhere else. Of the other layers
 //! only three rows are ever held.
 
-use super::Keypoint;
 use super::hessian::{Combined, Filter};
 use super::integral::{IntegralImage, SortedColumns};
+use super::{Keypoint, make_room};
 use crate::simd::widened;
 use std::ops::Range;
 
@@ -32,6 +32,13 @@ pub(super) struct Search {
     pub layers: usize,
     /// The determinant that a keypoint exceeds.
     pub threshold: f32,
+}
+
+impl Search {
+    /// Size of the largest keypoint that may be found, px.
+    pub(super) fn largest_px(&self) -> f32 {
+        Filter::new(self.octaves - 1, self.layers + 1).size_px as f32
+    }
 }
 
 /// The search with its working memory, above all the last three rows of determinants of every
@@ -286,6 +293,8 @@ fn find_candidates(
     found: &mut Vec<usize>,
 ) {
     let len = columns.len();
+    // Every second sample at most is above its neighbours.
+    make_room(found, len.div_ceil(2));
     if marks.len() < len.next_multiple_of(GROUP) {
         marks.resize(len.next_multiple_of(GROUP), 0);
     }

@@ -96,3 +96,8 @@ pub enum ExtractError {
         cause: String,
     },
 }
+
+/// Room for `count` elements in all, whatever the vector holds now.
+fn make_room<T>(vector: &mut Vec<T>, count: usize) {
+    vector.reserve(count.saturating_sub(vector.len()));
+}

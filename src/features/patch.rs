@@ -52,6 +52,13 @@ impl Patch {
         }
     }
 
+    /// Makes room for images of this size and keypoints up to `size_px`.
+    pub(super) fn make_room(&mut self, image: &GrayImage, size_px: f32) {
+        let (level, _) = level_of(cell_px(size_px));
+        self.pyramid
+            .make_room((image.width(), image.height()), level + 1);
+    }
+
     /// Prepares for another image.
     pub(super) fn begin(&mut self) {
         self.pyramid.clear();
@@ -64,19 +71,14 @@ impl Patch {
         keypoint: &Keypoint,
         direction: Direction,
     ) -> &Cells {
-        // OpenCV's patch has a whole number of pixels.
-        let cells = CELLS as f32;
-        let mut cell_px = (cells * keypoint.size_px * (1.2 / 9.0)).floor().max(1.0) / cells;
+        let (level, cell_px) = level_of(cell_px(keypoint.size_px));
         let (mut x_px, mut y_px) = (keypoint.x_px, keypoint.y_px);
-        let mut level = 0;
-        while cell_px > CELL_MAX_PX {
+        for _ in 0..level {
             // A level's pixel 0 has its centre between the pixels 0 and 1 of the level before.
             (x_px, y_px) = (0.5 * x_px - 0.25, 0.5 * y_px - 0.25);
-            cell_px *= 0.5;
-            level += 1;
         }
         let extent = direction.cos.abs() + direction.sin.abs();
-        let reach_px = (0.5 * cells * cell_px * extent).ceil() as i32 + 1;
+        let reach_px = (0.5 * CELLS as f32 * cell_px * extent).ceil() as i32 + 1;
         let left = x_px.floor() as i32 - reach_px;
         let top = y_px.floor() as i32 - reach_px;
         let window = Window {
@@ -95,6 +97,22 @@ impl Patch {
     pub(super) fn capacity(&self) -> usize {
         self.pyramid.capacity()
     }
+}
+
+/// The side of a cell of a keypoint's patch: OpenCV's patch has a whole number of pixels.
+fn cell_px(size_px: f32) -> f32 {
+    let cells = CELLS as f32;
+    (cells * size_px * (1.2 / 9.0)).floor().max(1.0) / cells
+}
+
+/// The level that cells of a side are sampled from, and their side in pixels of it.
+fn level_of(mut cell_px: f32) -> (usize, f32) {
+    let mut level = 0;
+    while cell_px > CELL_MAX_PX {
+        cell_px *= 0.5;
+        level += 1;
+    }
+    (level, cell_px)
 }
 
 widened! {

@@ -2,6 +2,7 @@
 //!
 //! Large keypoints are described from a smaller image, so that none costs more than another.
 
+use super::make_room;
 use crate::image::GrayImage;
 use crate::simd::widened;
 
@@ -27,6 +28,24 @@ pub(super) struct Level {
 }
 
 impl Pyramid {
+    /// Makes room for that many levels of images of a size.
+    pub(super) fn make_room(&mut self, (mut width, mut height): (u32, u32), levels: usize) {
+        for level in 0..levels {
+            if self.levels.len() == level {
+                self.levels.push(Level::default());
+                self.halved.push(GrayImage::default());
+            }
+            let bordered = |side_px: u32| side_px as usize + 2 * BORDER_PX;
+            let pairs = bordered(width) * bordered(height);
+            make_room(&mut self.levels[level].pairs, pairs);
+            let pixels = width as usize * height as usize;
+            if level > 0 && self.halved[level].pixels().len() < pixels {
+                self.halved[level].reshape(width, height);
+            }
+            (width, height) = (width.div_ceil(2), height.div_ceil(2));
+        }
+    }
+
     /// Forgets the last image.
     pub(super) fn clear(&mut self) {
         self.built = 0;

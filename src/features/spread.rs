@@ -5,7 +5,7 @@
 //! gives its best before a rich one gives its third, and what poor cells cannot use goes to the
 //! others. Well spread keypoints are what holds a motion's covariance down.
 
-use super::Keypoint;
+use super::{Keypoint, make_room};
 use std::cmp::Ordering;
 
 /// Keypoints a cell would hold if the image were equally rich everywhere. With fewer, one strong
@@ -19,20 +19,27 @@ pub(super) struct Spread {
     seen: Vec<u32>,
     /// Turn in which a keypoint is drawn, and its place among all by strength.
     turns: Vec<(u32, u32)>,
-    kept: Vec<Keypoint>,
 }
 
 impl Spread {
-    /// Sorts `keypoints` by strength and keeps at most `budget` of them (0: all) in an image of
-    /// `width × height` px.
+    /// Makes room for that many keypoints.
+    pub(super) fn make_room(&mut self, keypoints: usize) {
+        make_room(&mut self.turns, keypoints);
+    }
+
+    /// Sorts `keypoints` of an image of `width × height` px by strength, and leaves at most `budget`
+    /// of them (0: all) in `kept`, in that order.
     pub(super) fn keep(
         &mut self,
-        keypoints: &mut Vec<Keypoint>,
+        keypoints: &mut [Keypoint],
         budget: usize,
         (width, height): (u32, u32),
+        kept: &mut Vec<Keypoint>,
     ) {
+        kept.clear();
         keypoints.sort_unstable_by(stronger);
         if budget == 0 || keypoints.len() <= budget {
+            kept.extend_from_slice(keypoints);
             return;
         }
         let pixels = f64::from(width) * f64::from(height);
@@ -54,20 +61,14 @@ impl Spread {
         self.turns.select_nth_unstable(budget - 1);
         self.turns.truncate(budget);
         self.turns.sort_unstable_by_key(|&(_, place)| place);
-        let kept = self
-            .turns
-            .iter()
-            .map(|&(_, place)| keypoints[place as usize]);
-        self.kept.clear();
-        self.kept.extend(kept);
-        keypoints.clear();
-        keypoints.extend_from_slice(&self.kept);
+        let places = self.turns.iter().map(|&(_, place)| place as usize);
+        kept.extend(places.map(|place| keypoints[place]));
     }
 
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
-        self.seen.capacity() + self.turns.capacity() + self.kept.capacity()
+        self.seen.capacity() + self.turns.capacity()
     }
 }
 
@@ -108,23 +109,25 @@ mod tests {
             .collect()
     }
 
+    fn kept(mut keypoints: Vec<Keypoint>, budget: usize) -> Vec<Keypoint> {
+        let mut kept = vec![Keypoint::default()];
+        Spread::default().keep(&mut keypoints, budget, (400, 300), &mut kept);
+        kept
+    }
+
     #[test]
     fn keeps_the_budget_and_fills_it() {
         for budget in [1, 2, 10, 999, 2999, 3000, 5000] {
-            let mut keypoints = crowded();
-            Spread::default().keep(&mut keypoints, budget, (400, 300));
+            let keypoints = kept(crowded(), budget);
             assert_eq!(keypoints.len(), budget.min(3000));
             assert!(keypoints.is_sorted_by(|a, b| stronger(a, b) == Ordering::Less));
         }
-        let mut keypoints = crowded();
-        Spread::default().keep(&mut keypoints, 0, (400, 300));
-        assert_eq!(keypoints.len(), 3000);
+        assert_eq!(kept(crowded(), 0).len(), 3000);
     }
 
     #[test]
     fn the_poor_part_of_the_image_keeps_its_share() {
-        let mut keypoints = crowded();
-        Spread::default().keep(&mut keypoints, 400, (400, 300));
+        let keypoints = kept(crowded(), 400);
         let right = keypoints.iter().filter(|k| k.x_px >= 100.0).count();
         // 300 weak keypoints on three quarters of the area: nearly all of them are drawn.
         assert!(right > 220, "{right}");
@@ -136,19 +139,15 @@ mod tests {
 
     #[test]
     fn what_comes_first_does_not_depend_on_the_order_given() {
-        let mut forward = crowded();
         let mut backward = crowded();
         backward.reverse();
-        Spread::default().keep(&mut forward, 500, (400, 300));
-        Spread::default().keep(&mut backward, 500, (400, 300));
-        assert_eq!(forward, backward);
+        assert_eq!(kept(crowded(), 500), kept(backward, 500));
     }
 
     #[test]
     fn a_cell_gives_its_strongest() {
-        let mut keypoints = crowded();
+        let keypoints = kept(crowded(), 300);
         let all = crowded();
-        Spread::default().keep(&mut keypoints, 300, (400, 300));
         let weakest_kept = |cell: (i32, i32)| {
             let inside = |k: &&Keypoint| ((k.x_px / 40.0) as i32, (k.y_px / 40.0) as i32) == cell;
             let weakest = keypoints.iter().filter(inside).map(|k| k.response);

@@ -10,7 +10,7 @@ use super::extrema::{Detector, Search};
 use super::integral::IntegralImage;
 use super::orientation::{Compass, Direction};
 use super::spread::Spread;
-use super::{ExtractError, Extractor, Features, Keypoint};
+use super::{ExtractError, Extractor, Features, Keypoint, make_room};
 use crate::image::GrayImage;
 use crate::settings::SettingError;
 
@@ -19,6 +19,10 @@ const SCALE_PER_SIZE: f32 = 1.2 / 9.0;
 
 /// Size of a keypoint that is to be removed.
 const DROPPED: f32 = 0.0;
+
+/// Pixels for each keypoint that there is room for before the budget is applied: so few that hardly
+/// an image makes the room grow.
+const PIXELS_PER_FOUND: usize = 64;
 
 /// The knobs of [`Surf`].
 #[derive(Clone, Debug, PartialEq, serde::Deserialize, serde::Serialize)]
@@ -88,6 +92,7 @@ pub struct Surf {
     compass: Compass,
     integral: IntegralImage,
     detector: Detector,
+    found: Vec<Keypoint>,
     spread: Spread,
     describer: Describer,
     order: Vec<u32>,
@@ -105,10 +110,26 @@ impl Surf {
             compass: Compass::new(),
             integral: IntegralImage::default(),
             detector: Detector::default(),
+            found: Vec::new(),
             spread: Spread::default(),
             describer: Describer::new(),
             order: Vec::new(),
         })
+    }
+
+    /// Makes room for what an image of this size holds at the first of them: which worker meets the
+    /// richest image, and when, is chance.
+    fn make_room(&mut self, image: &GrayImage, features: &mut Features) {
+        let pixels = image.pixels().len();
+        let found = pixels / PIXELS_PER_FOUND;
+        let kept = self.settings.budget.min(pixels);
+        make_room(&mut self.found, found);
+        self.spread.make_room(found);
+        make_room(&mut self.order, kept);
+        make_room(&mut features.keypoints, kept);
+        let floats = kept * self.settings.descriptor_len();
+        make_room(&mut features.descriptors, floats);
+        self.describer.make_room(image, self.search().largest_px());
     }
 
     /// Gives direction, σ and descriptor to the keypoints; drops those so near to the border that
@@ -156,11 +177,20 @@ impl Surf {
         self.compass.direction(&self.integral, at, scale_px)
     }
 
+    fn search(&self) -> Search {
+        Search {
+            octaves: self.settings.octaves,
+            layers: self.settings.layers,
+            threshold: self.settings.hessian,
+        }
+    }
+
     /// Elements of working memory held.
     #[cfg(test)]
     fn capacity(&self) -> usize {
         self.integral.capacity()
             + self.detector.capacity()
+            + self.found.capacity()
             + self.spread.capacity()
             + self.describer.capacity()
             + self.order.capacity()
@@ -169,18 +199,15 @@ impl Surf {
 
 impl Extractor for Surf {
     fn extract(&mut self, image: &GrayImage, features: &mut Features) -> Result<(), ExtractError> {
-        features.keypoints.clear();
+        self.make_room(image, features);
+        self.found.clear();
         self.integral.compute(image);
-        let search = Search {
-            octaves: self.settings.octaves,
-            layers: self.settings.layers,
-            threshold: self.settings.hessian,
-        };
         self.detector
-            .detect(&self.integral, search, &mut features.keypoints);
+            .detect(&self.integral, self.search(), &mut self.found);
         let size = (image.width(), image.height());
+        let kept = &mut features.keypoints;
         self.spread
-            .keep(&mut features.keypoints, self.settings.budget, size);
+            .keep(&mut self.found, self.settings.budget, size, kept);
         self.describe(image, features);
         Ok(())
     }

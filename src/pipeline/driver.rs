@@ -14,8 +14,8 @@ use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
 use crate::image::GrayImage;
+use crate::queue::{Receiver, Sender, bounded};
 use crate::settings::SettingError;
-use crossbeam_channel::{Receiver, Sender, bounded};
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -98,12 +98,13 @@ const SLACK_PAIRS: usize = 2;
 /// # Errors
 /// What `deliver` failed with, or the system's refusal of a thread.
 pub fn run<S: PairSource, E>(
-    source: S,
+    mut source: S,
     extractors: Vec<Box<dyn Extractor>>,
     method: &mut Method,
     mut deliver: impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), PipelineError<E>> {
     let under_way = extractors.len() + SLACK_PAIRS;
+    source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
     let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);
     let (spare_in, spare) = bounded::<Spare>(under_way);
@@ -125,7 +126,8 @@ pub fn run<S: PairSource, E>(
             .map_err(PipelineError::Thread)?;
         // Whatever ends this loop drops its ends of the queues, which ends the threads.
         drop(jobs);
-        collect(&done, spare_in, method, &mut deliver)
+        let pending = VecDeque::with_capacity(under_way);
+        collect(&done, spare_in, pending, method, &mut deliver)
     })
 }
 
@@ -175,7 +177,7 @@ fn feed<S: PairSource>(
     done: &Sender<Done>,
 ) {
     let mut ticket = 0;
-    while let Ok(mut buffers) = spare.recv() {
+    while let Some(mut buffers) = spare.recv() {
         if let Some(pair) = buffers.used.take() {
             source.recycle(pair);
         }
@@ -228,7 +230,7 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
         }
     }
     let _alarm = Alarm(done);
-    while let Ok(mut job) = jobs.recv() {
+    while let Some(mut job) = jobs.recv() {
         let started = Instant::now();
         let result = extractor.extract(&job.image, &mut job.described.features);
         job.described.pyramid.fill(&job.image);
@@ -258,14 +260,15 @@ struct Half {
     failed: Option<String>,
 }
 
-/// Puts events back in order and steps the method through them.
+/// Puts events back in order and steps the method through them. `pending` is empty, with room for
+/// all that are under way.
 fn collect<E>(
     done: &Receiver<Done>,
     spare: Sender<Spare>,
+    mut pending: VecDeque<Pending>,
     method: &mut Method,
     deliver: &mut impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), PipelineError<E>> {
-    let mut pending: VecDeque<Pending> = VecDeque::new();
     let mut first_ticket = 0;
     let mut described = DescribedPair::default();
     let slot = |pending: &mut VecDeque<Pending>, first: u64, ticket: u64| -> usize {
@@ -275,7 +278,7 @@ fn collect<E>(
         }
         at
     };
-    while let Ok(message) = done.recv() {
+    while let Some(message) = done.recv() {
         match message {
             Done::WorkerDied => return Err(PipelineError::Worker),
             Done::Unusable {
