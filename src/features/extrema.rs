@@ -6,9 +6,10 @@
 //! *Invariant Features from Interest Point Groups*, 2002), and a candidate whose top lies more than
 //! one sample away is none.
 //!
-//! The lowest and the highest layer of an octave hold no keypoints, so they are computed where a
-//! sample of the layer beside them is the highest so far, and nowhere else. Of the other layers
-//! only three rows are ever held.
+//! The lowest and the highest layer of an octave hold no keypoints. They are not searched, so what is
+//! found is candidates: samples that exceed their neighbours in the layers between. Only those that
+//! have a chance to be among the keypoints that are kept are then [confirmed](Detector::confirm).
+//! Of a layer that is searched only three rows are ever held.
 
 use super::hessian::{Combined, Filter};
 use super::integral::{IntegralImage, SortedColumns};
@@ -48,37 +49,81 @@ pub(super) struct Detector {
     columns: SortedColumns,
     combined: Combined,
     marks: Vec<u8>,
-    candidates: Vec<usize>,
-    filters: Vec<Filter>,
+    highest: Vec<usize>,
+    /// Of all octaves, those that fit into the image.
+    filters: Vec<Vec<Filter>>,
     samples: usize,
     /// Row by row of each layer but the lowest and the highest.
     determinants: Vec<f32>,
+}
+
+/// A sample that may be a keypoint.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(super) struct Candidate {
+    octave: u8,
+    layer: u8,
+    row: u32,
+    column: u32,
+    /// The samples around it in its own layer and those beside it, as far as these are searched.
+    near: [Layer; 3],
+}
+
+impl Candidate {
+    /// One without neighbours.
+    #[cfg(test)]
+    pub(super) fn lone(octave: u8, (row, column): (u32, u32), response: f32) -> Self {
+        let mut near = [[[0.0; 3]; 3]; 3];
+        near[1][1][1] = response;
+        Self {
+            octave,
+            layer: 1,
+            row,
+            column,
+            near,
+        }
+    }
+
+    /// Its determinant.
+    pub(super) fn response(&self) -> f32 {
+        self.near[1][1][1]
+    }
+
+    /// Where the keypoint lies: from the first to the second value of each coordinate, px.
+    pub(super) fn reach_px(&self) -> [[f32; 2]; 2] {
+        let step_px = (1 << self.octave) as f32;
+        [self.column, self.row].map(|sample| {
+            let middle_px = middle_px(sample as usize, step_px);
+            [middle_px - step_px, middle_px + step_px]
+        })
+    }
 }
 
 /// The samples around one in a layer: `values[row][column]`.
 type Layer = [[f32; 3]; 3];
 
 impl Detector {
-    /// Appends the keypoints to `keypoints`, without direction and σ, octave by octave, row by row.
+    /// Appends the candidates to `found`, octave by octave, row by row.
     pub(super) fn detect(
         &mut self,
         integral: &IntegralImage,
         search: Search,
-        keypoints: &mut Vec<Keypoint>,
+        found: &mut Vec<Candidate>,
     ) {
         self.columns.begin(integral, search.octaves - 1);
+        self.filters.resize(search.octaves as usize, Vec::new());
         for octave in 0..search.octaves {
-            self.filters.clear();
             let filters = (0..search.layers + 2).map(|layer| Filter::new(octave, layer));
-            self.filters
-                .extend(filters.take_while(|f| f.fits(integral)));
-            if self.filters.len() < 3 {
+            let fitting = &mut self.filters[octave as usize];
+            fitting.clear();
+            make_room(fitting, search.layers + 2);
+            fitting.extend(filters.take_while(|f| f.fits(integral)));
+            if fitting.len() < 3 {
                 break;
             }
             if octave > 0 {
                 self.columns.double_step(integral);
             }
-            self.detect_in_octave(integral, search.threshold, octave, keypoints);
+            self.detect_in_octave(integral, search.threshold, octave, found);
         }
     }
 
@@ -87,18 +132,19 @@ impl Detector {
         integral: &IntegralImage,
         threshold: f32,
         octave: u32,
-        keypoints: &mut Vec<Keypoint>,
+        found: &mut Vec<Candidate>,
     ) {
         self.samples = integral.width() >> octave;
-        self.determinants
-            .resize((self.filters.len() - 2) * 3 * self.samples, 0.0);
+        let filters = &self.filters[octave as usize];
+        let values = (filters.len() - 2) * 3 * self.samples;
         let strip = if octave == 0 { STRIP } else { self.samples };
         // The first sample with complete neighbours in the second layer.
-        let first = self.filters[2].margin() + 1;
+        let first = filters[2].margin() + 1;
+        self.determinants.resize(values, 0.0);
         let mut start = first;
         while start + first < self.samples {
             let end = (start + strip).min(self.samples - first);
-            self.detect_in_strip(integral, threshold, octave, start..end, keypoints);
+            self.detect_in_strip(integral, threshold, octave, start..end, found);
             start = end;
         }
     }
@@ -110,12 +156,13 @@ impl Detector {
         threshold: f32,
         octave: u32,
         strip: Range<usize>,
-        keypoints: &mut Vec<Keypoint>,
+        found: &mut Vec<Candidate>,
     ) {
         let around = strip.start - 1..strip.end + 1;
         for row in 0..integral.height() >> octave {
-            for layer in 1..self.filters.len() - 1 {
-                let filter = &self.filters[layer];
+            let layers = 1..self.filters[octave as usize].len() - 1;
+            for layer in layers.clone() {
+                let filter = &self.filters[octave as usize][layer];
                 let margin = filter.margin();
                 let samples = margin..margin + filter.samples(integral, row);
                 let wanted = around.start.max(samples.start)..around.end.min(samples.end);
@@ -129,9 +176,9 @@ impl Detector {
             let Some(centre) = row.checked_sub(1) else {
                 continue;
             };
-            for layer in 1..self.filters.len() - 1 {
+            for layer in layers {
                 let at = (octave, layer, centre);
-                self.search_row(integral, threshold, at, &strip, keypoints);
+                self.search_row(integral, threshold, at, &strip, found);
             }
         }
     }
@@ -143,48 +190,49 @@ impl Detector {
         threshold: f32,
         (octave, layer, centre): (u32, usize, usize),
         strip: &Range<usize>,
-        keypoints: &mut Vec<Keypoint>,
+        found: &mut Vec<Candidate>,
     ) {
         // All neighbours must be complete, which the layer above decides.
-        let margin = self.filters[layer + 1].margin() + 1;
+        let margin = self.filters[octave as usize][layer + 1].margin() + 1;
         let rows = integral.height() >> octave;
         if centre < margin || centre + margin >= rows || 2 * margin >= self.samples {
             return;
         }
         let columns = strip.start.max(margin)..strip.end.min(self.samples - margin);
-        let mut candidates = std::mem::take(&mut self.candidates);
+        let mut highest = std::mem::take(&mut self.highest);
         let mut marks = std::mem::take(&mut self.marks);
-        candidates.clear();
+        highest.clear();
         let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
         let beside = [layer - 1, layer + 1].map(|beside| {
-            if self.is_held(beside) {
+            if self.is_held(octave, beside) {
                 self.row(beside, centre)
             } else {
                 near[0]
             }
         });
         let rows = [near[0], near[1], near[2], beside[0], beside[1]];
-        find_candidates(&rows, threshold, columns, &mut marks, &mut candidates);
-        for &column in &candidates {
-            let Some(layers) = self.layers_around(integral, (layer, centre, column)) else {
-                continue;
-            };
-            if let Some(offset) = top_of_quadratic(&layers) {
-                let filter = &self.filters[layer];
-                keypoints.push(Keypoint {
-                    response: layers[1][1][1],
-                    octave: octave as i32,
-                    laplacian: filter.laplacian_sign(integral, centre, column),
-                    ..self.place(layer, (column, centre), offset)
+        find_highest(&rows, threshold, columns, &mut marks, &mut highest);
+        for &column in &highest {
+            let mut near = [[[0.0; 3]; 3]; 3];
+            self.copy_held((octave, layer, centre, column), &mut near);
+            let value = near[1][1][1];
+            // A layer that is not held is zero here, and the value above a threshold that is not below.
+            if exceeds(value, &near[0]) && exceeds(value, &near[2]) {
+                found.push(Candidate {
+                    octave: octave as u8,
+                    layer: layer as u8,
+                    row: centre as u32,
+                    column: column as u32,
+                    near,
                 });
             }
         }
-        (self.candidates, self.marks) = (candidates, marks);
+        (self.highest, self.marks) = (highest, marks);
     }
 
     /// Whether a layer is an inner one.
-    fn is_held(&self, layer: usize) -> bool {
-        0 < layer && layer + 1 < self.filters.len()
+    fn is_held(&self, octave: u32, layer: usize) -> bool {
+        0 < layer && layer + 1 < self.filters[octave as usize].len()
     }
 
     /// Where row `row` of an inner layer starts among the determinants.
@@ -197,78 +245,48 @@ impl Detector {
         &self.determinants[self.start(layer, row)..][..self.samples]
     }
 
-    /// The samples around one that exceeds its neighbours in its own layer; `None` unless it exceeds
-    /// those in the layers beside it, too.
-    fn layers_around(
+    /// Copies the samples around one in its layer and those beside it that are held.
+    fn copy_held(
         &self,
-        integral: &IntegralImage,
-        (layer, row, column): (usize, usize, usize),
-    ) -> Option<[Layer; 3]> {
-        let mut layers = [[[0.0; 3]; 3]; 3];
-        self.held(layer, row, column, &mut layers[1]);
-        let value = layers[1][1][1];
-        // What costs nothing first.
-        for beside in [0, 2] {
-            if self.is_held(layer + beside - 1) {
-                self.held(layer + beside - 1, row, column, &mut layers[beside]);
-                if !exceeds(value, &layers[beside]) {
-                    return None;
+        (octave, layer, row, column): (u32, usize, usize, usize),
+        near: &mut [Layer; 3],
+    ) {
+        for (n, values) in near.iter_mut().enumerate() {
+            let layer = layer + n - 1;
+            if self.is_held(octave, layer) {
+                for (y, values) in values.iter_mut().enumerate() {
+                    let held = self.row(layer, row + y - 1);
+                    values.copy_from_slice(&held[column - 1..=column + 1]);
                 }
             }
         }
-        for beside in [0, 2] {
-            if !self.is_held(layer + beside - 1) {
-                let at = (layer + beside - 1, row, column);
-                if !self.computed_while_below(value, integral, at, &mut layers[beside]) {
-                    return None;
-                }
-            }
-        }
-        Some(layers)
     }
 
-    /// Copies the samples around one of an inner layer.
-    fn held(&self, layer: usize, row: usize, column: usize, values: &mut Layer) {
-        for (n, values) in values.iter_mut().enumerate() {
-            let start = self.start(layer, row + n - 1) + column - 1;
-            values.copy_from_slice(&self.determinants[start..start + 3]);
-        }
-    }
-
-    /// Computes the samples around one, and says whether all are below `value`; stops at the first
-    /// that is not. The middle one, most often the highest, comes first.
-    fn computed_while_below(
+    /// The keypoint at a candidate of the last image, without direction and σ; `None` unless it
+    /// exceeds its neighbours in the layers that were not searched, too, and has a top.
+    pub(super) fn confirm(
         &self,
-        value: f32,
         integral: &IntegralImage,
-        (layer, row, column): (usize, usize, usize),
-        values: &mut Layer,
-    ) -> bool {
-        let filter = &self.filters[layer];
-        for n in [4, 1, 3, 5, 7, 0, 2, 6, 8] {
-            let (y, x) = (n / 3, n % 3);
-            let other = filter.determinant(integral, row + y - 1, column + x - 1);
-            if value <= other {
-                return false;
+        candidate: &Candidate,
+    ) -> Option<Keypoint> {
+        let (octave, layer) = (candidate.octave, candidate.layer as usize);
+        let filters = &self.filters[octave as usize];
+        let at = (candidate.row as usize, candidate.column as usize);
+        let mut layers = candidate.near;
+        for n in [0, 2] {
+            if !self.is_held(u32::from(octave), layer + n - 1) {
+                let filter = &filters[layer + n - 1];
+                layers[n] = samples_below(candidate.response(), filter, integral, at)?;
             }
-            values[y][x] = other;
         }
-        true
-    }
-
-    /// Place and size of the keypoint `offset` samples from sample `(column, row)` of `layer`.
-    fn place(&self, layer: usize, (column, row): (usize, usize), offset: [f32; 3]) -> Keypoint {
-        let filter = &self.filters[layer];
-        let step_px = filter.step_px as f32;
-        let layer_step_px = (filter.size_px - self.filters[layer - 1].size_px) as f32;
-        // The middle of the filter, which has an even number of pixels from the second octave on.
-        let middle_px = |sample: usize| (sample as f32 + 0.5) * step_px - 0.5;
-        Keypoint {
-            x_px: middle_px(column) + offset[0] * step_px,
-            y_px: middle_px(row) + offset[1] * step_px,
-            size_px: (filter.size_px as f32 + offset[2] * layer_step_px).round_ties_even(),
-            ..Keypoint::default()
-        }
+        let offset = top_of_quadratic(&layers)?;
+        let layer_step_px = filters[layer].size_px - filters[layer - 1].size_px;
+        Some(Keypoint {
+            response: candidate.response(),
+            octave: i32::from(octave),
+            laplacian: filters[layer].laplacian_sign(integral, at.0, at.1),
+            ..place(&filters[layer], layer_step_px as f32, at, offset)
+        })
     }
 
     /// Elements held.
@@ -277,15 +295,60 @@ impl Detector {
         self.columns.capacity()
             + self.combined.capacity()
             + self.marks.capacity()
-            + self.candidates.capacity()
-            + self.filters.capacity()
+            + self.highest.capacity()
+            + self.filters.iter().map(Vec::capacity).sum::<usize>()
             + self.determinants.capacity()
     }
 }
 
+/// The order in which neighbours are looked at: the middle one is most often the highest.
+const MIDDLE_FIRST: [usize; 9] = [4, 1, 3, 5, 7, 0, 2, 6, 8];
+
+/// The samples around one of a layer; `None` if one of them is not below `value`.
+fn samples_below(
+    value: f32,
+    filter: &Filter,
+    integral: &IntegralImage,
+    (row, column): (usize, usize),
+) -> Option<Layer> {
+    let mut samples = [[0.0; 3]; 3];
+    for n in MIDDLE_FIRST {
+        let (y, x) = (n / 3, n % 3);
+        let sample = filter.determinant(integral, row + y - 1, column + x - 1);
+        if value <= sample {
+            return None;
+        }
+        samples[y][x] = sample;
+    }
+    Some(samples)
+}
+
+/// Place and size of the keypoint `offset` samples from sample `(row, column)` of a filter's layer,
+/// whose size exceeds that of the one below by `layer_step_px`.
+fn place(
+    filter: &Filter,
+    layer_step_px: f32,
+    (row, column): (usize, usize),
+    offset: [f32; 3],
+) -> Keypoint {
+    let step_px = filter.step_px as f32;
+    Keypoint {
+        x_px: middle_px(column, step_px) + offset[0] * step_px,
+        y_px: middle_px(row, step_px) + offset[1] * step_px,
+        size_px: (filter.size_px as f32 + offset[2] * layer_step_px).round_ties_even(),
+        ..Keypoint::default()
+    }
+}
+
+/// The middle of the filter at a sample, which has an even number of pixels from the second octave
+/// on.
+fn middle_px(sample: usize, step_px: f32) -> f32 {
+    (sample as f32 + 0.5) * step_px - 0.5
+}
+
 /// Appends every column of the middle of three rows that exceeds the threshold, its eight
 /// neighbours and the two rows of other layers that follow to `found`; `marks` is working memory.
-fn find_candidates(
+fn find_highest(
     rows: &[&[f32]; 5],
     threshold: f32,
     columns: Range<usize>,
@@ -312,7 +375,7 @@ fn find_candidates(
 }
 
 widened! {
-    /// Marks with 1 what [`find_candidates`] is after, with 0 what it is not; the rows begin one
+    /// Marks with 1 what [`find_highest`] is after, with 0 what it is not; the rows begin one
     /// column before.
     fn mark_highest = mark_highest_narrow, (rows: [&[f32]; 5], threshold: f32, marks: &mut [u8])
 }

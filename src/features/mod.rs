@@ -4,6 +4,7 @@
 
 mod choice;
 mod descriptor;
+mod draw;
 mod extrema;
 mod hessian;
 mod integral;

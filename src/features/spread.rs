@@ -33,7 +33,7 @@ impl Spread {
         &mut self,
         keypoints: &mut [Keypoint],
         budget: usize,
-        (width, height): (u32, u32),
+        size_px: (u32, u32),
         kept: &mut Vec<Keypoint>,
     ) {
         kept.clear();
@@ -42,19 +42,12 @@ impl Spread {
             kept.extend_from_slice(keypoints);
             return;
         }
-        let pixels = f64::from(width) * f64::from(height);
-        let side_px = (pixels * KEYPOINTS_PER_CELL / budget as f64)
-            .sqrt()
-            .max(1.0);
-        let cells_across = (f64::from(width) / side_px).ceil() as usize;
-        let cells_down = (f64::from(height) / side_px).ceil() as usize;
+        let grid = Grid::new(budget, size_px);
         self.seen.clear();
-        self.seen.resize(cells_across * cells_down, 0);
+        self.seen.resize(grid.cells(), 0);
         self.turns.clear();
         for (place, keypoint) in (0..).zip(keypoints.iter()) {
-            let cell = |at_px: f32, cells| ((f64::from(at_px) / side_px) as usize).min(cells - 1);
-            let at =
-                cell(keypoint.y_px, cells_down) * cells_across + cell(keypoint.x_px, cells_across);
+            let at = grid.cell_of(keypoint);
             self.turns.push((self.seen[at], place));
             self.seen[at] += 1;
         }
@@ -69,6 +62,45 @@ impl Spread {
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
         self.seen.capacity() + self.turns.capacity()
+    }
+}
+
+/// The cells of an image.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Grid {
+    side_px: f64,
+    across: usize,
+    down: usize,
+}
+
+impl Grid {
+    /// The cells for a budget above 0 in an image of `width × height` px.
+    pub(super) fn new(budget: usize, (width, height): (u32, u32)) -> Self {
+        let pixels = f64::from(width) * f64::from(height);
+        let side_px = (pixels * KEYPOINTS_PER_CELL / budget as f64)
+            .sqrt()
+            .max(1.0);
+        Self {
+            side_px,
+            across: (f64::from(width) / side_px).ceil() as usize,
+            down: (f64::from(height) / side_px).ceil() as usize,
+        }
+    }
+
+    /// How many there are.
+    pub(super) fn cells(&self) -> usize {
+        self.across * self.down
+    }
+
+    /// The cell of a place; those outside count for the cell at the border.
+    pub(super) fn cell(&self, x_px: f32, y_px: f32) -> usize {
+        let along = |at_px: f32, cells| ((f64::from(at_px) / self.side_px) as usize).min(cells - 1);
+        along(y_px, self.down) * self.across + along(x_px, self.across)
+    }
+
+    /// The cell of a keypoint.
+    pub(super) fn cell_of(&self, keypoint: &Keypoint) -> usize {
+        self.cell(keypoint.x_px, keypoint.y_px)
     }
 }
 

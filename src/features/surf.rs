@@ -3,10 +3,11 @@
 //! Bay, Ess, Tuytelaars, Van Gool: *Speeded-Up Robust Features (SURF)*, Computer Vision and Image
 //! Understanding 110 (3), 2008. Thresholds, sizes, angles, signs and the order of a descriptor's
 //! floats are those of OpenCV's SURF, so that values compare. The steps are files of their own:
-//! integral image, Hessian responses, their extrema, spread, orientation, descriptor.
+//! integral image, Hessian responses, their extrema, draw, spread, orientation, descriptor.
 
 use super::descriptor::Describer;
-use super::extrema::{Detector, Search};
+use super::draw::Draw;
+use super::extrema::{Candidate, Detector, Search};
 use super::integral::IntegralImage;
 use super::orientation::{Compass, Direction};
 use super::spread::Spread;
@@ -20,8 +21,10 @@ const SCALE_PER_SIZE: f32 = 1.2 / 9.0;
 /// Size of a keypoint that is to be removed.
 const DROPPED: f32 = 0.0;
 
-/// Pixels for each keypoint that there is room for before the budget is applied: so few that hardly
-/// an image makes the room grow.
+/// Pixels for each candidate that there is room for from the start: so few that hardly an image makes
+/// the room grow.
+const PIXELS_PER_CANDIDATE: usize = 32;
+/// The same for each keypoint before the budget is applied.
 const PIXELS_PER_FOUND: usize = 64;
 
 /// The knobs of [`Surf`].
@@ -92,6 +95,8 @@ pub struct Surf {
     compass: Compass,
     integral: IntegralImage,
     detector: Detector,
+    candidates: Vec<Candidate>,
+    draw: Draw,
     found: Vec<Keypoint>,
     spread: Spread,
     describer: Describer,
@@ -110,6 +115,8 @@ impl Surf {
             compass: Compass::new(),
             integral: IntegralImage::default(),
             detector: Detector::default(),
+            candidates: Vec::new(),
+            draw: Draw::default(),
             found: Vec::new(),
             spread: Spread::default(),
             describer: Describer::new(),
@@ -123,6 +130,9 @@ impl Surf {
         let pixels = image.pixels().len();
         let found = pixels / PIXELS_PER_FOUND;
         let kept = self.settings.budget.min(pixels);
+        let candidates = pixels / PIXELS_PER_CANDIDATE;
+        make_room(&mut self.candidates, candidates);
+        self.draw.make_room(candidates);
         make_room(&mut self.found, found);
         self.spread.make_room(found);
         make_room(&mut self.order, kept);
@@ -190,6 +200,8 @@ impl Surf {
     fn capacity(&self) -> usize {
         self.integral.capacity()
             + self.detector.capacity()
+            + self.candidates.capacity()
+            + self.draw.capacity()
             + self.found.capacity()
             + self.spread.capacity()
             + self.describer.capacity()
@@ -200,14 +212,21 @@ impl Surf {
 impl Extractor for Surf {
     fn extract(&mut self, image: &GrayImage, features: &mut Features) -> Result<(), ExtractError> {
         self.make_room(image, features);
-        self.found.clear();
         self.integral.compute(image);
+        self.candidates.clear();
         self.detector
-            .detect(&self.integral, self.search(), &mut self.found);
-        let size = (image.width(), image.height());
+            .detect(&self.integral, self.search(), &mut self.candidates);
+        let (size, budget) = ((image.width(), image.height()), self.settings.budget);
+        self.found.clear();
+        self.draw.confirm(
+            &self.candidates,
+            budget,
+            size,
+            |candidate| self.detector.confirm(&self.integral, candidate),
+            &mut self.found,
+        );
         let kept = &mut features.keypoints;
-        self.spread
-            .keep(&mut self.found, self.settings.budget, size, kept);
+        self.spread.keep(&mut self.found, budget, size, kept);
         self.describe(image, features);
         Ok(())
     }
