@@ -5,6 +5,7 @@
 //! `(x + ½) 2ˡ − ½` of the image, likewise y.
 
 use crate::image::GrayImage;
+use crate::simd::widened;
 
 /// How many levels there are: the coarsest is an eighth of the image.
 pub const LEVELS: usize = 4;
@@ -65,15 +66,35 @@ fn smooth(image: &GrayImage, out: &mut GrayImage, rows: &mut [Vec<u16>; 3]) {
         let next = (y + 1).min(last);
         smooth_row(image.row(next), &mut rows[2]);
         let target = &mut out.pixels_mut()[y as usize * width as usize..][..width as usize];
-        for (((t, a), b), c) in target.iter_mut().zip(&rows[0]).zip(&rows[1]).zip(&rows[2]) {
-            *t = ((a + 2 * b + c + 8) >> 4) as u8;
-        }
+        smooth_columns(&rows[0], &rows[1], &rows[2], target);
         rows.rotate_left(1);
     }
 }
 
-/// (1 2 1) along a row.
-fn smooth_row(row: &[u8], out: &mut [u16]) {
+widened! {
+    /// (1 2 1) / 16 down the columns of three rows, rounded.
+    fn smooth_columns = smooth_columns_narrow, (
+        above: &[u16],
+        here: &[u16],
+        below: &[u16],
+        out: &mut [u8],
+    )
+}
+
+#[inline(always)]
+fn smooth_columns_narrow(above: &[u16], here: &[u16], below: &[u16], out: &mut [u8]) {
+    for (((o, a), b), c) in out.iter_mut().zip(above).zip(here).zip(below) {
+        *o = ((a + 2 * b + c + 8) >> 4) as u8;
+    }
+}
+
+widened! {
+    /// (1 2 1) along a row.
+    fn smooth_row = smooth_row_narrow, (row: &[u8], out: &mut [u16])
+}
+
+#[inline(always)]
+fn smooth_row_narrow(row: &[u8], out: &mut [u16]) {
     let n = row.len();
     if n == 1 {
         out[0] = 4 * u16::from(row[0]);
@@ -98,14 +119,21 @@ fn halve(finer: &GrayImage, coarser: &mut GrayImage) {
     for y in 0..height {
         let (top, bottom) = (finer.row(2 * y), finer.row(2 * y + 1));
         let target = &mut coarser.pixels_mut()[y as usize * width as usize..][..width as usize];
-        for ((t, a), b) in target
-            .iter_mut()
-            .zip(top.chunks_exact(2))
-            .zip(bottom.chunks_exact(2))
-        {
-            let sum = u16::from(a[0]) + u16::from(a[1]) + u16::from(b[0]) + u16::from(b[1]);
-            *t = ((sum + 2) >> 2) as u8;
-        }
+        average(top, bottom, target);
+    }
+}
+
+widened! {
+    /// Averages of 2 × 2 pixels of two rows.
+    fn average = average_narrow, (top: &[u8], bottom: &[u8], out: &mut [u8])
+}
+
+#[inline(always)]
+fn average_narrow(top: &[u8], bottom: &[u8], out: &mut [u8]) {
+    let (top, bottom) = (top.as_chunks::<2>().0, bottom.as_chunks::<2>().0);
+    for ((o, a), b) in out.iter_mut().zip(top).zip(bottom) {
+        let sum = u16::from(a[0]) + u16::from(a[1]) + u16::from(b[0]) + u16::from(b[1]);
+        *o = ((sum + 2) >> 2) as u8;
     }
 }
 

@@ -1,14 +1,15 @@
 //! How long a whole pair takes, from images in memory to its row: `cargo bench --bench pipeline`.
 //!
-//! With words after `--` it shows something else: `growth`, how the time grows with pixels and with
-//! keypoints; `endurance [PAIRS]`, whether time and memory stay flat over 10,000 pairs;
-//! `paced [HZ]`, the latency of a steady stream of 40 pairs a second; `profile [PAIRS]`, the
+//! It also shows how the processor's time divides over the stages, and the latency of a steady stream of
+//! 40 pairs a second. With words after `--` it shows something else: `growth`, how the time grows with pixels
+//! and with keypoints; `endurance [PAIRS]`, whether time and memory stay flat over 10,000 pairs;
+//! `paced [HZ]`, the latency at another rate; `profile [PAIRS]`, the
 //! simulated recording once, as a profiler likes it.
 
 mod common;
 
 use common::memory::{Recording, ToAndFro};
-use common::{memory_mb, ms, process_time, words};
+use common::{memory_mb, ms, process_time, thread_time, words};
 use std::convert::Infallible;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
@@ -16,7 +17,7 @@ use visod::capture::Realtime;
 use visod::capture::{PairEvent, PairSource, StereoPair};
 use visod::features::{self, Extractor};
 use visod::geometry::StereoRig;
-use visod::pipeline::{self, Delivery, Method, StageLatencies};
+use visod::pipeline::{self, Delivery, DescribedPair, Method, StageLatencies};
 use visod::simulation::{small_rig, thesis_rig};
 
 /// Pairs of one measurement.
@@ -38,7 +39,11 @@ fn main() {
             let run = Run::of(&recording, number.unwrap_or(300.0) as u64, 1000, 2);
             println!("{:.2} ms of processor time a pair", run.cpu_ms);
         }
-        _ => throughput(),
+        _ => {
+            throughput();
+            division();
+            paced(40.0);
+        }
     }
 }
 
@@ -150,6 +155,77 @@ fn throughput() {
     );
 }
 
+/// Where the processor's time goes, pair by pair in one thread.
+fn division() {
+    println!(
+        "\n### Division: processor time a pair, one thread, 1,000 keypoints an image, median ms\n"
+    );
+    println!(
+        "| recording | features, both images | reductions, both | matching | estimation | all |"
+    );
+    println!("|---|---:|---:|---:|---:|---:|");
+    let simulated = Recording::simulated(thesis_rig(), FRAMES);
+    let kitti = Recording::recorded("kitti_straight", 20);
+    for (name, recording) in [("1280 × 960", Some(simulated)), ("KITTI", kitti)] {
+        let Some(recording) = recording else {
+            println!("| {name} | skipped: the recording is not there |");
+            continue;
+        };
+        let mut times = divided(&recording);
+        let all = (0..times[0].len()).map(|n| times.iter().map(|stage| stage[n]).sum());
+        let mut all: Vec<f64> = all.collect();
+        let median = |times: &mut Vec<f64>| {
+            times.sort_unstable_by(f64::total_cmp);
+            times[times.len() / 2]
+        };
+        let all_ms = median(&mut all);
+        let [features, reductions, matching, estimation] = times.each_mut().map(median);
+        println!(
+            "| {name} | {features:.2} | {reductions:.2} | {matching:.2} | {estimation:.2} | {all_ms:.2} |"
+        );
+    }
+}
+
+/// What each pair took in features, reductions, matching and estimation, ms.
+fn divided(recording: &Recording) -> [Vec<f64>; 4] {
+    let (matching, estimation) = (Default::default(), Default::default());
+    let Some(mut method) = Method::new(recording.rig.clone(), matching, estimation) else {
+        unreachable!("the cameras stand side by side")
+    };
+    let mut extractor = extractor(1000);
+    let mut pair = DescribedPair::default();
+    let mut times: [Vec<f64>; 4] = Default::default();
+    for place in 0..WARM_UP + PAIRS {
+        let images = &recording.pairs[recording.index(place)];
+        let begun = thread_time();
+        for (image, side) in [
+            (&images.left, &mut pair.left),
+            (&images.right, &mut pair.right),
+        ] {
+            assert_eq!(extractor.extract(image, &mut side.features), Ok(()));
+        }
+        let found = thread_time();
+        pair.left.pyramid.fill(&images.left);
+        pair.right.pyramid.fill(&images.right);
+        let reduced = thread_time();
+        (pair.sequence, pair.timestamp_ns) = (place, 100_000_000 * place as i64);
+        assert!(method.step(&mut pair).is_ok());
+        let stepped = ms(thread_time() - reduced);
+        // The method says what its two stages took on the wall; the processor's time is shared alike.
+        let wall = method.times();
+        let share = ms(wall.matching) / ms(wall.matching + wall.estimation).max(1e-9);
+        if place >= WARM_UP {
+            let stages = [ms(found - begun), ms(reduced - found), share * stepped];
+            let stages = [stages[0], stages[1], stages[2], (1.0 - share) * stepped];
+            times
+                .iter_mut()
+                .zip(stages)
+                .for_each(|(all, one)| all.push(one));
+        }
+    }
+    times
+}
+
 fn growth() {
     println!("\n### Growth: processor time a pair\n");
     println!(
@@ -241,6 +317,10 @@ impl PairSource for Rate {
             pair.timestamp_ns = (pair.sequence as f64 * 1e9 / self.1) as i64;
         }
         Some(event)
+    }
+
+    fn make_room(&mut self, pairs_held: usize) {
+        self.0.make_room(pairs_held);
     }
 
     fn recycle(&mut self, pair: StereoPair) {

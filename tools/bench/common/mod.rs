@@ -68,11 +68,6 @@ pub fn line(work: &str, times: &Times, remark: &str) {
     );
 }
 
-/// How much longer the yardstick took than ours, by the best processor times.
-pub fn ratio(yardstick: &Times, ours: &Times) -> String {
-    format!("{:.1} ×", yardstick.best_ms() / ours.best_ms())
-}
-
 /// Processor time of this thread so far.
 pub fn thread_time() -> Duration {
     clock(rustix::time::ClockId::ThreadCPUTime)
