@@ -39,3 +39,6 @@ mod replay_publication;
 mod report;
 #[cfg(test)]
 mod samples;
+#[cfg(test)]
+#[cfg(feature = "v4l")]
+mod v4l2;
