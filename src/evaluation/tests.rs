@@ -65,6 +65,9 @@ fn row(
         variance_factor: 1.0,
         latency_ms: None,
         epoch: 0,
+        innovation_ratio: f64::NAN,
+        budget_sigmas: [0.0; 24],
+        is_first_order: true,
     }
 }
 

@@ -90,7 +90,9 @@ impl Settings {
     pub(super) fn window(&self) -> estimation::Settings {
         estimation::Settings {
             min_inliers: 6,
+            // A rig that states its errors is as uncertain as that; else it is exact.
             calibration_sigma_px: 0.0,
+            consider_calibration: self.rig_error == RigError::Considered,
             gate_sigma2: self.gate_sigma2,
             ..estimation::Settings::default()
         }
