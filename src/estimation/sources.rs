@@ -110,7 +110,11 @@ impl RigErrors {
         };
         let warp = of(WARP_COLUMNS, WARP);
         let (detection, of_warp) = without(cov, &warp);
-        let modes = of(MODE_COLUMNS, MODES);
+        let modes = if self.has_modes {
+            of(MODE_COLUMNS, MODES)
+        } else {
+            Matrix6::zeros()
+        };
         let calibration = if self.warp_counts {
             modes + of_warp
         } else {

@@ -395,7 +395,12 @@ mod tests {
             mtx,mty,mtz,mqx,mqy,mqz,mqw,\
             m00,m01,m02,m03,m04,m05,m11,m12,m13,m14,m15,m22,m23,m24,m25,m33,m34,m35,m44,m45,m55,\
             keypoints_left,keypoints_right,stereo_matches,tracks,inliers,variance_factor,\
-            latency_ms,epoch";
+            latency_ms,epoch,innovation_ratio,\
+            sigma_detection_x,sigma_detection_y,sigma_detection_z,sigma_detection_rx,sigma_detection_ry,sigma_detection_rz,\
+            sigma_calibration_x,sigma_calibration_y,sigma_calibration_z,sigma_calibration_rx,sigma_calibration_ry,sigma_calibration_rz,\
+            sigma_synchronisation_x,sigma_synchronisation_y,sigma_synchronisation_z,sigma_synchronisation_rx,sigma_synchronisation_ry,sigma_synchronisation_rz,\
+            sigma_bridging_x,sigma_bridging_y,sigma_bridging_z,sigma_bridging_rx,sigma_bridging_ry,sigma_bridging_rz,\
+            first_order";
         assert_eq!(header_line(), expected);
         let mut names = Vec::new();
         OdometryRow::new(&sample_odometry(0), None).for_each(|name, _| names.push(name.to_owned()));
