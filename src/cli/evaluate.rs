@@ -43,9 +43,13 @@ pub(crate) struct Args {
     /// covariances must explain.
     #[arg(long, value_name = "M", default_value_t = 0.0)]
     truth_sigma_m: f64,
-    /// The same of rotations, deg.
+    /// The same of rotations, deg: one for every axis, or three, for x, y, z.
+    #[arg(long, value_name = "DEG", value_delimiter = ',', default_value = "0")]
+    truth_sigma_deg: Vec<f64>,
+    /// 1 σ per axis of how the sensor that the truth is from is turned against the camera, deg: the
+    /// same error in the direction of every motion.
     #[arg(long, value_name = "DEG", default_value_t = 0.0)]
-    truth_sigma_deg: f64,
+    truth_sigma_mounting_deg: f64,
     /// Print everything as JSON.
     #[arg(long)]
     json: bool,
@@ -96,10 +100,22 @@ fn settings(args: &Args) -> Result<Settings, Failure> {
     if args.step == 0 {
         return Err(Failure::usage("--step must be at least 1"));
     }
+    let sigma_deg = match args.truth_sigma_deg[..] {
+        [all] => [all; 3],
+        [x, y, z] => [x, y, z],
+        _ => {
+            return Err(Failure::usage(
+                "--truth-sigma-deg must be one number or three",
+            ));
+        }
+    };
     for (flag, value) in [
         ("--max-difference", args.max_difference),
         ("--truth-sigma-m", args.truth_sigma_m),
-        ("--truth-sigma-deg", args.truth_sigma_deg),
+        ("--truth-sigma-mounting-deg", args.truth_sigma_mounting_deg),
+        ("--truth-sigma-deg", sigma_deg[0]),
+        ("--truth-sigma-deg", sigma_deg[1]),
+        ("--truth-sigma-deg", sigma_deg[2]),
     ] {
         if !(0.0..=1e6).contains(&value) {
             return Err(Failure::usage(format!(
@@ -112,7 +128,8 @@ fn settings(args: &Args) -> Result<Settings, Failure> {
         step: args.step,
         max_difference_ns: (args.max_difference * 1e9).round() as i64,
         truth_sigma_m: args.truth_sigma_m,
-        truth_sigma_rad: args.truth_sigma_deg.to_radians(),
+        truth_sigma_rad: sigma_deg.map(f64::to_radians),
+        truth_sigma_mounting_rad: args.truth_sigma_mounting_deg.to_radians(),
         ..Settings::default()
     };
     if let Some(align) = args.align {

@@ -5,10 +5,10 @@ use crate::estimation::MotionModel;
 use crate::estimation::two_frame::Estimator;
 use crate::geometry::{StereoRig, load_rig};
 use crate::montecarlo::{
-    Correlation, MonteCarloError, Outcomes, RigError, Settings, figure_files, run_motion,
-    run_odometry, run_triangulation, summary_text, to_csv, to_json,
+    Correlation, MonteCarloError, Outcomes, RigError, Settings, figure_files, run_images,
+    run_motion, run_odometry, run_triangulation, summary_text, to_csv, to_json,
 };
-use crate::simulation::{points::PixelNoise, thesis_rig};
+use crate::simulation::{points::PixelNoise, small_rig, thesis_rig};
 use std::path::PathBuf;
 
 /// Hold first-order covariances against the errors of many simulated runs.
@@ -22,9 +22,11 @@ use std::path::PathBuf;
 #[command(after_help = "\
 Example: visod montecarlo --runs 1000 -o montecarlo
          visod montecarlo --stage motion --method svd --model planar
-         visod montecarlo --stage odometry --survival 0.5 --noise student --freedom 5")]
+         visod montecarlo --stage odometry --survival 0.5 --noise student --freedom 5
+         visod montecarlo --stage images --method window --runs 50 --steps 50")]
 pub(crate) struct Args {
-    /// Pixels to points, points to a motion, motions to a path; all three otherwise.
+    /// Pixels to points, points to a motion, motions to a path, all three otherwise; or whole image
+    /// sequences, rendered in several scenes.
     #[arg(long, value_enum)]
     stage: Option<Stage>,
     /// Motions of any kind, or on flat ground: x, y and heading.
@@ -33,7 +35,8 @@ pub(crate) struct Args {
     /// The estimator; motions of their own are bundle-adjusted where it is the window.
     #[arg(long, value_enum, default_value_t = Method::Bundle)]
     method: Method,
-    /// The rig, from a rig.toml [default: the thesis' two cameras of 1280×960 pixels].
+    /// The rig, from a rig.toml [default: the thesis' two cameras of 1280×960 pixels; for images two
+    /// of 320×240].
     #[arg(long, value_name = "FILE")]
     rig: Option<PathBuf>,
     /// How many runs.
@@ -118,6 +121,8 @@ enum Stage {
     Motion,
     /// Motions to a path.
     Odometry,
+    /// Rendered images to a path, through the whole pipeline.
+    Images,
 }
 
 #[derive(Clone, Copy, clap::ValueEnum)]
@@ -133,6 +138,7 @@ enum Noise {
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let rig = match &args.rig {
         Some(file) => load_rig(file).map_err(Failure::usage)?,
+        None if args.stage == Some(Stage::Images) => small_rig(),
         None => thesis_rig(),
     };
     let settings = args.settings()?;
@@ -171,7 +177,7 @@ fn run_stages(
 ) -> Result<Outcomes, MonteCarloError> {
     let wanted = |stage: Stage| args.stage.is_none_or(|only| only == stage);
     let stages = [Stage::Triangulation, Stage::Motion, Stage::Odometry];
-    let count = stages.iter().filter(|s| wanted(**s)).count() as u64;
+    let count = stages.iter().filter(|s| wanted(**s)).count().max(1) as u64;
     let bar = progress::runs(count * settings.runs);
     let progress = |runs: u64| bar.inc(runs);
     let mut outcomes = Outcomes::default();
@@ -183,6 +189,9 @@ fn run_stages(
     }
     if wanted(Stage::Odometry) {
         outcomes.odometry = Some(run_odometry(rig, settings, &progress)?);
+    }
+    if args.stage == Some(Stage::Images) {
+        outcomes.images = Some(run_images(rig, settings, &progress)?);
     }
     bar.finish_and_clear();
     Ok(outcomes)

@@ -38,6 +38,7 @@ pub(crate) struct Session {
     publish_failures: u64,
     each_row: Option<RowWatcher>,
     live: Option<Monitor>,
+    warned_of_first_order: bool,
 }
 
 /// What a run came to.
@@ -85,6 +86,7 @@ impl Session {
             publish_failures: 0,
             each_row: None,
             live: None,
+            warned_of_first_order: false,
         }
     }
 
@@ -163,6 +165,7 @@ impl Session {
                 }
                 first_unusable.get_or_insert_with(|| why.to_owned());
             }
+            self.warn_of_first_order(&delivery, &bar);
             last = Some(self.deliver(&delivery, &bar)?);
             bar.inc(1);
             Ok::<_, io::Error>(ControlFlow::Continue(()))
@@ -191,6 +194,25 @@ impl Session {
             publish_failures: self.publish_failures,
             first_unusable,
         })
+    }
+
+    /// Says once that the pose's covariance does not describe its error any more.
+    fn warn_of_first_order(&mut self, delivery: &Delivery<'_>, bar: &ProgressBar) {
+        if self.warned_of_first_order || delivery.odometry.is_first_order() {
+            return;
+        }
+        self.warned_of_first_order = true;
+        let sequence = delivery.odometry.sequence;
+        if self.live.is_some() {
+            tracing::warn!(sequence, "rotation too uncertain for a covariance of the pose");
+        } else {
+            bar.suspend(|| {
+                eprintln!(
+                    "visod: warning: from pair {sequence} on the rotation is uncertain by more than 0.2 rad: \
+                     the covariance does not describe the pose's error any more, that of the motion does"
+                );
+            });
+        }
     }
 
     /// Hands one row to everything that wants it.

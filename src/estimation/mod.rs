@@ -13,6 +13,8 @@ pub mod planar;
 pub mod reprojection;
 mod settings;
 mod sight;
+pub mod sources;
+mod standing;
 #[cfg(test)]
 mod synthetic;
 pub mod track_noise;
@@ -21,9 +23,9 @@ pub mod two_frame;
 pub mod weighted;
 pub mod window;
 
-pub use model::{Model, MotionModel, Plane};
-pub use motion::{MeasuredMotion, measure};
-pub use odometer::{Odometer, PairStamp};
+pub use model::{FLAT_LIMIT, Model, MotionModel, Plane};
+pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
+pub use odometer::{Odometer, PairStamp, Place};
 pub use settings::{Method, Settings};
 pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
@@ -78,9 +80,35 @@ pub struct Counts {
 pub struct ErrorBudget {
     /// From the detection of keypoints.
     pub detection: Matrix6<f64>,
+    /// From the calibration of the rig.
+    pub calibration: Matrix6<f64>,
+    /// From images that were not taken at the same instant.
+    pub synchronisation: Matrix6<f64>,
     /// From motions that had to be bridged because they could not be measured.
     pub bridging: Matrix6<f64>,
 }
+
+impl ErrorBudget {
+    /// The parts with their names, in the order of the fields.
+    #[must_use]
+    pub fn parts(&self) -> [(&'static str, &Matrix6<f64>); 4] {
+        [
+            ("detection", &self.detection),
+            ("calibration", &self.calibration),
+            ("synchronisation", &self.synchronisation),
+            ("bridging", &self.bridging),
+        ]
+    }
+
+    /// The whole.
+    #[must_use]
+    pub fn total(&self) -> Matrix6<f64> {
+        self.detection + self.calibration + self.synchronisation + self.bridging
+    }
+}
+
+/// σ of a rotation beyond which positions that hang on it bend: errors are then no ellipsoid, rad.
+const FIRST_ORDER_RAD: f64 = 0.2;
 
 /// Pose, motion and velocity after one stereo pair, each with its covariance.
 ///
@@ -115,4 +143,23 @@ pub struct Odometry {
     pub counts: Counts,
     /// A-posteriori variance factor: 1 when residuals are as large as the noise model says.
     pub variance_factor: f64,
+    /// Normalised innovations squared of the pair over what the noise model would be rejected at:
+    /// below 0.5 it is fine, above 1 it does not hold. Not a number where nothing was measured.
+    pub innovation_ratio: f64,
+}
+
+impl Odometry {
+    /// Whether the pose's covariance describes its error: false once the rotation's σ about any
+    /// axis is above 0.2 rad, for then positions err along an arc that no ellipsoid covers.
+    #[must_use]
+    pub fn is_first_order(&self) -> bool {
+        is_first_order(&self.cov_pose)
+    }
+}
+
+/// [`Odometry::is_first_order`] of a covariance.
+#[must_use]
+pub fn is_first_order(cov_pose: &Matrix6<f64>) -> bool {
+    let limit = FIRST_ORDER_RAD * FIRST_ORDER_RAD;
+    (3..6).all(|axis| cov_pose[(axis, axis)] <= limit)
 }

@@ -98,6 +98,22 @@ impl Plane {
         (self.plane_from_camera * v).xy()
     }
 
+    /// The camera twists that leave the plane: heave, roll and pitch; 6×3, orthonormal columns.
+    #[must_use]
+    pub fn across(&self) -> SMatrix<f64, 6, 3> {
+        let camera_from_plane = self.plane_from_camera.inverse();
+        let mut across = SMatrix::<f64, 6, 3>::zeros();
+        across
+            .fixed_view_mut::<3, 1>(0, 0)
+            .copy_from(&(camera_from_plane * Vector3::z()));
+        for (column, axis) in [(1, Vector3::x()), (2, Vector3::y())] {
+            across
+                .fixed_view_mut::<3, 1>(3, column)
+                .copy_from(&(camera_from_plane * axis));
+        }
+        across
+    }
+
     /// How far an unconstrained motion leaves the plane, in units of its own covariance: the
     /// normalised square of heave, roll and pitch, three degrees of freedom.
     ///
@@ -112,16 +128,7 @@ impl Plane {
         sigma_tilt_rad: f64,
     ) -> Option<f64> {
         let xi = se3::log(&motion.prev_from_now);
-        let camera_from_plane = self.plane_from_camera.inverse();
-        let mut across = SMatrix::<f64, 6, 3>::zeros();
-        across
-            .fixed_view_mut::<3, 1>(0, 0)
-            .copy_from(&(camera_from_plane * Vector3::z()));
-        for (column, axis) in [(1, Vector3::x()), (2, Vector3::y())] {
-            across
-                .fixed_view_mut::<3, 1>(3, column)
-                .copy_from(&(camera_from_plane * axis));
-        }
+        let across = self.across();
         let allowed = Vector3::new(sigma_heave_m, sigma_tilt_rad, sigma_tilt_rad);
         let cov = across.transpose() * motion.cov_right * across
             + Matrix3::from_diagonal(&allowed.component_mul(&allowed));
@@ -193,6 +200,10 @@ impl Model {
         }
     }
 }
+
+/// The departure from the plane that one pair in a thousand has on flat ground (χ² with three
+/// degrees of freedom).
+pub const FLAT_LIMIT: f64 = 16.27;
 
 /// The share of a diagonal element that elimination must leave of it: metres and radians are scaled
 /// alike first, so that this is a matter of geometry.

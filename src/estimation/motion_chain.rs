@@ -34,6 +34,15 @@ pub struct MotionChain {
 }
 
 impl MotionChain {
+    /// A chain whose first motion starts from a pose of this covariance.
+    #[must_use]
+    pub fn beginning_at(cov: &Matrix6<f64>) -> Self {
+        Self {
+            settled: *cov,
+            ..Self::default()
+        }
+    }
+
     /// Chains one more motion. Tracks have rising numbers.
     pub fn advance(
         &mut self,

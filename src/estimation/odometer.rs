@@ -6,10 +6,12 @@
 //! bridge is forgotten.
 
 use super::closed_form::MotionEstimate;
+use super::sources::{BySources, Exposure, RigErrors};
+use super::standing::Standing;
 use super::window::Tracked;
-use super::{Counts, ErrorBudget, MeasuredMotion, Odometry, Settings, Status};
+use super::{Counts, ErrorBudget, FLAT_LIMIT, MeasuredMotion, Odometry, Settings, Status};
 use crate::geometry::se3;
-use crate::uncertainty::compounding;
+use crate::uncertainty::{compounding, consider};
 use nalgebra::{Isometry3, Matrix6, Vector6};
 
 /// The origin is a pose by definition; its covariance only has to be positive definite: (1 µm)²,
@@ -29,12 +31,16 @@ pub struct PairStamp {
     pub timestamp_ns: i64,
 }
 
-/// A pose with its covariances, all of right perturbations.
+/// Where a robot stands and how sure that is, all of right perturbations.
 #[derive(Clone, Copy, Debug)]
-struct Place {
-    odom_from_camera: Isometry3<f64>,
+pub struct Place {
+    /// The pose.
+    pub odom_from_camera: Isometry3<f64>,
+    /// Covariance by the pixels' noise and, if one was estimated, by the warp's prior.
+    pub cov: Matrix6<f64>,
+    /// What each source of error does to it.
+    pub by_sources: BySources,
     timestamp_ns: i64,
-    detection: Matrix6<f64>,
     bridging: Matrix6<f64>,
 }
 
@@ -49,6 +55,7 @@ struct Velocity {
 #[derive(Clone, Debug)]
 pub struct Odometer {
     settings: Settings,
+    errors: RigErrors,
     epoch: u32,
     reference: Place,
     last: Place,
@@ -58,20 +65,24 @@ pub struct Odometer {
     bridged: u32,
     tracked_in_epoch: bool,
     variance_factor: f64,
+    standing: Standing,
 }
 
 impl Odometer {
     /// Begins at the origin with the first pair.
     #[must_use]
-    pub fn new(settings: Settings, stamp: PairStamp) -> Self {
+    pub fn new(settings: Settings, errors: RigErrors, stamp: PairStamp) -> Self {
         let origin = Place {
             odom_from_camera: Isometry3::identity(),
             timestamp_ns: stamp.timestamp_ns,
-            detection: Matrix6::identity() * ORIGIN_VARIANCE,
+            cov: Matrix6::identity() * ORIGIN_VARIANCE,
+            by_sources: BySources::zeros(),
             bridging: Matrix6::zeros(),
         };
         Self {
+            standing: Standing::new(settings.good_inliers),
             settings,
+            errors,
             epoch: 0,
             reference: origin,
             last: origin,
@@ -114,7 +125,14 @@ impl Odometer {
             cov_right: Matrix6::identity() * ORIGIN_VARIANCE,
             ..no_motion()
         };
-        self.row(stamp, Status::Initializing, &motion, counts, 1.0)
+        self.standing.begin();
+        self.row(
+            stamp,
+            Status::Initializing,
+            &motion,
+            counts,
+            Noise::as_stated(),
+        )
     }
 
     /// Whether any motion has been measured since the odometry frame began.
@@ -124,21 +142,24 @@ impl Odometer {
     }
 
     /// The row of a pair whose motion `reference_from_now` was measured; the pair becomes the
-    /// reference.
+    /// reference. `cov_chained` is what the noise of all motions up to now makes of the pose's
+    /// covariance, their correlation included.
     pub fn advance(
         &mut self,
         stamp: PairStamp,
         measured: &MeasuredMotion,
+        cov_chained: &Matrix6<f64>,
         counts: Counts,
     ) -> Odometry {
         let reference_from_now = measured.estimate.prev_from_now;
-        let cov = measured.estimate.cov_right;
+        let carry = se3::adjoint(&reference_from_now.inverse());
         let now = Place {
             odom_from_camera: se3::renormalised(
                 self.reference.odom_from_camera * reference_from_now,
             ),
             timestamp_ns: stamp.timestamp_ns,
-            detection: compounding::chain(&self.reference.detection, &reference_from_now, &cov),
+            cov: *cov_chained,
+            by_sources: carry * self.reference.by_sources + measured.by_sources,
             bridging: compounding::carry(&self.reference.bridging, &reference_from_now),
         };
         self.go_on(stamp, now, measured, counts)
@@ -152,21 +173,30 @@ impl Odometer {
         measured: &MeasuredMotion,
         counts: Counts,
     ) -> Odometry {
-        let since_last = self.since_last_row(&measured.estimate);
+        let parts = self
+            .errors
+            .apart(&measured.estimate.cov_right, &measured.by_sources);
+        let since_last = self.since_last_row(&MotionEstimate {
+            prev_from_now: measured.estimate.prev_from_now,
+            cov_right: parts.total(),
+        });
         let dt_s = seconds_between(self.last.timestamp_ns, stamp.timestamp_ns);
-        self.velocity = velocity_of(&since_last, dt_s);
+        self.velocity = velocity_of(&since_last, dt_s, self.sigma_stamp_s());
+        let noise = Noise {
+            variance_factor: measured.variance_factor,
+            innovation_ratio: innovation_ratio(measured.variance_factor, self.variance_factor),
+        };
         self.variance_factor = 0.8 * self.variance_factor + 0.2 * measured.variance_factor;
         self.tracked_in_epoch = true;
         self.bridged = 0;
         self.reference = now;
         self.last = now;
         self.reference_from_last = no_motion();
-        let status = if measured.inliers >= self.settings.good_inliers {
-            Status::Tracking
-        } else {
-            Status::Degraded
-        };
-        self.row(stamp, status, &since_last, counts, measured.variance_factor)
+        let is_flat = measured.departure.is_none_or(|d| d <= FLAT_LIMIT);
+        let status = self
+            .standing
+            .measured(measured.inliers, noise.innovation_ratio, is_flat);
+        self.row(stamp, status, &since_last, counts, noise)
     }
 
     /// The row of a pair whose pose the window knows; the pair becomes the reference.
@@ -174,21 +204,48 @@ impl Odometer {
         let place = Place {
             odom_from_camera: tracked.odom_from_now,
             timestamp_ns: stamp.timestamp_ns,
-            detection: tracked.cov_pose_right,
+            cov: tracked.cov_pose_right,
+            by_sources: tracked.pose_by_sources,
             bridging: compounding::carry(&self.reference.bridging, &tracked.motion.prev_from_now),
         };
         let measured = MeasuredMotion {
             estimate: tracked.motion,
+            by_sources: tracked.motion_by_sources,
             variance_factor: tracked.variance_factor,
             inliers: tracked.inliers,
+            departure: tracked.departure,
         };
         self.go_on(stamp, place, &measured, counts)
     }
 
-    /// Where the last row stands, and how sure that is (right perturbation), bridges left out.
+    /// Where the last row stands, and how sure that is, bridges left out.
     #[must_use]
-    pub fn last_place(&self) -> (Isometry3<f64>, Matrix6<f64>) {
-        (self.last.odom_from_camera, self.last.detection)
+    pub fn last_place(&self) -> &Place {
+        &self.last
+    }
+
+    /// How the images of a pair were taken whose right one came `skew_s` late (1 σ `sigma_skew_s`):
+    /// the camera moving as it did last. Without a velocity, or where skew is not to be considered,
+    /// as if at the same instant.
+    #[must_use]
+    pub fn exposure(&self, skew_s: f64, sigma_skew_s: f64) -> Exposure {
+        if !self.settings.consider_synchronisation || !self.tracked_in_epoch {
+            return Exposure::default();
+        }
+        Exposure {
+            twist: self.velocity.twist,
+            skew_s,
+            sigma_skew_s,
+        }
+    }
+
+    /// 1 σ of a time stamp as far as it is to be considered, s.
+    fn sigma_stamp_s(&self) -> f64 {
+        if self.settings.consider_synchronisation {
+            self.settings.timestamp_sigma_s
+        } else {
+            0.0
+        }
     }
 
     /// The row of a pair whose motion could not be measured: the pose goes on with the last
@@ -203,7 +260,8 @@ impl Odometer {
         self.last = Place {
             odom_from_camera: se3::renormalised(self.last.odom_from_camera * step),
             timestamp_ns: stamp.timestamp_ns,
-            detection: compounding::carry(&self.last.detection, step),
+            cov: compounding::carry(&self.last.cov, step),
+            by_sources: se3::adjoint(&step.inverse()) * self.last.by_sources,
             bridging: compounding::chain(&self.last.bridging, step, &motion.cov_right),
         };
         self.reference_from_last = MotionEstimate {
@@ -215,7 +273,12 @@ impl Odometer {
             ),
         };
         self.bridged += 1;
-        self.row(stamp, Status::Lost, &motion, counts, self.variance_factor)
+        self.standing.lost();
+        let noise = Noise {
+            variance_factor: self.variance_factor,
+            innovation_ratio: f64::NAN,
+        };
+        self.row(stamp, Status::Lost, &motion, counts, noise)
     }
 
     /// Whether the reference has been out of sight for so long that the frame should begin anew.
@@ -234,6 +297,7 @@ impl Odometer {
         self.velocity = unknown_velocity();
         self.bridged = 0;
         self.tracked_in_epoch = false;
+        self.standing.begin();
         row.epoch = self.epoch;
         row.status = Status::Initializing;
         row
@@ -280,12 +344,16 @@ impl Odometer {
         status: Status,
         motion: &MotionEstimate,
         counts: Counts,
-        variance_factor: f64,
+        noise: Noise,
     ) -> Odometry {
         let pose = &self.last.odom_from_camera;
+        let parts = self.errors.apart(&self.last.cov, &self.last.by_sources);
+        let in_odom = |cov: &Matrix6<f64>| se3::cov_fixed_axes_from_right(pose, cov);
         let budget = ErrorBudget {
-            detection: se3::cov_fixed_axes_from_right(pose, &self.last.detection),
-            bridging: se3::cov_fixed_axes_from_right(pose, &self.last.bridging),
+            detection: in_odom(&parts.detection),
+            calibration: in_odom(&parts.calibration),
+            synchronisation: in_odom(&parts.synchronisation),
+            bridging: in_odom(&self.last.bridging),
         };
         Odometry {
             sequence: stamp.sequence,
@@ -293,16 +361,44 @@ impl Odometer {
             epoch: self.epoch,
             status,
             odom_from_camera: *pose,
-            cov_pose: budget.detection + budget.bridging,
+            cov_pose: budget.total(),
             prev_from_now: motion.prev_from_now,
             cov_motion: se3::cov_fixed_axes_from_right(&motion.prev_from_now, &motion.cov_right),
             twist: self.velocity.twist,
             cov_twist: self.velocity.cov,
             budget,
             counts,
-            variance_factor,
+            variance_factor: noise.variance_factor,
+            innovation_ratio: noise.innovation_ratio,
         }
     }
+}
+
+/// What a pair's residuals say of the noise model.
+#[derive(Clone, Copy, Debug)]
+struct Noise {
+    variance_factor: f64,
+    innovation_ratio: f64,
+}
+
+impl Noise {
+    /// Of a pair without residuals, with which an odometry begins.
+    fn as_stated() -> Self {
+        Self {
+            variance_factor: 1.0,
+            innovation_ratio: f64::NAN,
+        }
+    }
+}
+
+/// Normalised innovations squared that a noise model is rejected at: residuals of twice the σ that
+/// the pairs before lead to expect.
+const IMPLAUSIBLE_FACTOR: f64 = 4.0;
+
+/// A pair's normalised innovations squared over what they are rejected at. A quarter is par; below a
+/// half the noise model is plausible, above 1 it is not.
+fn innovation_ratio(variance_factor: f64, expected: f64) -> f64 {
+    variance_factor / (IMPLAUSIBLE_FACTOR * expected)
 }
 
 fn no_motion() -> MotionEstimate {
@@ -321,15 +417,18 @@ fn unknown_velocity() -> Velocity {
     }
 }
 
-fn velocity_of(motion: &MotionEstimate, dt_s: f64) -> Velocity {
+/// The mean velocity over a motion, its covariance that of the motion and of the two stamps.
+fn velocity_of(motion: &MotionEstimate, dt_s: f64, sigma_stamp_s: f64) -> Velocity {
     if dt_s <= 0.0 {
         return unknown_velocity();
     }
     let xi = se3::log(&motion.prev_from_now);
     let by_right = se3::right_jacobian_inverse(&xi) / dt_s;
+    let twist = xi / dt_s;
+    let of_motion = by_right * motion.cov_right * by_right.transpose();
     Velocity {
-        twist: xi / dt_s,
-        cov: se3::symmetric(&(by_right * motion.cov_right * by_right.transpose())),
+        twist,
+        cov: se3::symmetric(&of_motion) + consider::of_interval(&twist, dt_s, sigma_stamp_s),
     }
 }
 

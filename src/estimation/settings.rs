@@ -1,5 +1,7 @@
 //! How motion is estimated.
 
+use super::MotionModel;
+use super::two_frame::Estimator;
 use crate::settings::SettingError;
 use serde::{Deserialize, Serialize};
 
@@ -9,6 +11,8 @@ use serde::{Deserialize, Serialize};
 pub enum Method {
     /// Closed form on triangulated points, as the thesis has it: simple, and coarse.
     Svd,
+    /// Triangulated points, each weighted by its own covariance.
+    Weighted,
     /// Two-frame stereo bundle adjustment in the images.
     Bundle,
     /// Bundle adjustment over a window of keyframes, of landmarks that are tracked to a fraction of
@@ -17,13 +21,37 @@ pub enum Method {
     Window,
 }
 
+impl Method {
+    /// The estimator of motions between two pairs; `None` for the window.
+    #[must_use]
+    pub fn of_two_frames(self) -> Option<Estimator> {
+        match self {
+            Self::Svd => Some(Estimator::Svd),
+            Self::Weighted => Some(Estimator::Weighted),
+            Self::Bundle => Some(Estimator::Bundle),
+            Self::Window => None,
+        }
+    }
+}
+
 /// How motion is estimated.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct Settings {
-    /// The estimator: "svd", "bundle" or "window". Default "window": "bundle", from pair to pair, is
-    /// half as good, and the closed form a hundred times coarser on distant points.
+    /// The estimator: "svd", "weighted", "bundle" or "window". Default "window": "bundle", from pair
+    /// to pair, is half as good, "weighted" gathers a bias, and the closed form "svd" is a hundred
+    /// times coarser on distant points.
     pub method: Method,
+    /// What motions are possible: "se3", any, or "planar", those of a robot on flat ground: the plane
+    /// is that of the rig's mounting, else that of a camera which looks straight ahead. Default
+    /// "se3": few floors are flat.
+    pub model: MotionModel,
+    /// How far flat ground may fail to be flat, for the planar model: 1 σ of heave from keyframe to
+    /// keyframe, or from pair to pair. Pairs that leave the plane by more are degraded. m, 1e-5 to 1,
+    /// default 0.005: a threshold between two rooms.
+    pub flat_sigma_m: f64,
+    /// The same of roll and of pitch. rad, 1e-5 to 1, default 0.005: what suspension does.
+    pub flat_sigma_rad: f64,
     /// Tracks that must agree for a motion to count as measured. 3 to 1000, default 12: below, one
     /// wrong track can lead the estimate.
     pub min_inliers: u32,
@@ -52,6 +80,15 @@ pub struct Settings {
     /// with the motion. px, 0 to 10, default 0.3: what published recordings show; 0 takes the
     /// calibration as exact.
     pub calibration_sigma_px: f64,
+    /// Whether the rig's uncertainty, stated or supposed, goes into the covariance of pose and motion.
+    /// Default true: an error of the rig does not average out.
+    pub consider_calibration: bool,
+    /// Whether a known time between a pair's exposures is compensated, and its uncertainty and that
+    /// of time stamps go into covariances. Default true.
+    pub consider_synchronisation: bool,
+    /// 1 σ of a pair's time stamp, which makes velocities uncertain. s, 0 to 1, default 0.0001: what a
+    /// computer's clock tells of a camera's.
+    pub timestamp_sigma_s: f64,
     /// Pairs without a measured motion that are bridged before the odometry frame begins anew. 0 to
     /// 10000, default 20.
     pub max_bridged: u32,
@@ -66,6 +103,9 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             method: Method::Window,
+            model: MotionModel::Se3,
+            flat_sigma_m: 0.005,
+            flat_sigma_rad: 0.005,
             min_inliers: 12,
             good_inliers: 30,
             max_samples: 500,
@@ -73,6 +113,9 @@ impl Default for Settings {
             seed: 1,
             keyframes: 7,
             calibration_sigma_px: 0.3,
+            consider_calibration: true,
+            consider_synchronisation: true,
+            timestamp_sigma_s: 1e-4,
             max_landmarks: 300,
             keyframe_survival: 0.7,
             keyframe_parallax: 0.015,
@@ -102,6 +145,9 @@ impl Settings {
             self.calibration_sigma_px,
             0.0..=10.0,
         )?;
+        SettingError::unless_in("flat_sigma_m", self.flat_sigma_m, 1e-5..=1.0)?;
+        SettingError::unless_in("flat_sigma_rad", self.flat_sigma_rad, 1e-5..=1.0)?;
+        SettingError::unless_in("timestamp_sigma_s", self.timestamp_sigma_s, 0.0..=1.0)?;
         SettingError::unless_in("max_bridged", self.max_bridged, 0..=10_000)?;
         SettingError::unless_in("acceleration_m_s2", self.acceleration_m_s2, 1e-6..=1000.0)?;
         SettingError::unless_in(

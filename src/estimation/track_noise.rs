@@ -16,6 +16,7 @@
 use super::bundle::TrackedPoint;
 use super::influence::Influence;
 use super::sight;
+use super::two_frame::TwoFrameMotion;
 use crate::geometry::product::{product, product_transposed};
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{Isometry3, Matrix3, Matrix6, SMatrix, SVector, Vector3, Vector4};
@@ -117,6 +118,66 @@ const MEMORY: f64 = 0.98;
 /// Squared residuals beyond this many times the variance factor are blunders (five degrees of
 /// freedom). Tracks come here judged; a narrow gate on top would cut off the tails that are noise.
 const GATE: f64 = 100.0;
+
+/// Measures the noise of one motion's tracks after the other.
+#[derive(Clone, Debug)]
+pub struct TrackNoiseWatch {
+    meter: TrackNoiseMeter,
+    /// Of the motion before, by the tracks' numbers.
+    residuals: Vec<(u64, TrackResidual)>,
+    motion_freedom: f64,
+}
+
+impl TrackNoiseWatch {
+    /// A watch that expects a detector's noise; motions have so many degrees of freedom.
+    #[must_use]
+    pub fn new(motion_freedom: usize) -> Self {
+        Self {
+            meter: TrackNoiseMeter::new(&TrackNoise::of_detector(1.0)),
+            residuals: Vec::new(),
+            motion_freedom: motion_freedom as f64,
+        }
+    }
+
+    /// Forgets which tracks there were, not what was learnt of their noise.
+    pub fn forget_tracks(&mut self) {
+        self.residuals.clear();
+    }
+
+    /// Takes note of a motion's residuals; what its tracks' noise is. `ids` and `points` are those
+    /// that the motion was estimated from, ids rising.
+    pub fn observe(
+        &mut self,
+        rig: &StereoRig,
+        motion: &TwoFrameMotion,
+        ids: &[u64],
+        points: &[TrackedPoint],
+    ) -> TrackNoise {
+        self.meter.age();
+        let residuals: Vec<(u64, TrackResidual)> = motion
+            .tracks
+            .iter()
+            .filter_map(|&i| {
+                let residual = TrackResidual::new(rig, &motion.reprojected, &points[i as usize])?;
+                Some((ids[i as usize], residual))
+            })
+            .collect();
+        let mut before = self.residuals.iter().peekable();
+        for (id, residual) in &residuals {
+            while before.next_if(|(other, _)| other < id).is_some() {}
+            let before = before.next_if(|(other, _)| other == id);
+            self.meter
+                .observe(before.map(|(_, before)| before), residual);
+        }
+        // The motion, too, was fitted to the residuals.
+        let count = 5.0 * residuals.len().max(2) as f64;
+        let fitted = count / (count - self.motion_freedom);
+        self.residuals = residuals;
+        let mut noise = self.meter.noise();
+        noise.variance_factor *= fitted;
+        noise
+    }
+}
 
 /// Measures the noise of tracks.
 #[derive(Clone, Debug)]

@@ -7,12 +7,13 @@
 
 use crate::estimation::Status;
 use crate::geometry::se3::error_fixed_axes;
+use crate::geometry::so3;
 use crate::output::row::OdometryRow;
 use crate::uncertainty::consistency::{
     anees_interval, autocorrelation, autocorrelation_limit, chi2_quantile, coverage,
     coverage_interval, nees, whiten,
 };
-use nalgebra::{Isometry3, Matrix6, SVector, Vector6};
+use nalgebra::{Isometry3, Matrix3, Matrix6, Matrix6x3, SVector, Vector6};
 
 /// The probability of intervals and ellipsoids.
 pub const LEVEL: f64 = 0.95;
@@ -160,18 +161,45 @@ pub struct EndPose {
     pub nees_limit: f64,
 }
 
+/// What the truth may itself be wrong by.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TruthErrors {
+    /// Covariance of its own motion from row to row: new in each.
+    pub cov_motion: Matrix6<f64>,
+    /// 1 σ per axis of how its sensor is turned against the camera, the same all along, rad.
+    pub sigma_mounting_rad: f64,
+}
+
+impl TruthErrors {
+    /// What a true motion is uncertain by, as its fixed-axes error. A sensor that is turned by a
+    /// small φ sees the motion (R, t) as that of the camera turned by φ: it errs by φ × t and by
+    /// φ − R φ.
+    #[must_use]
+    pub fn covariance(&self, prev_from_now: &Isometry3<f64>) -> Matrix6<f64> {
+        let mut by_mounting = Matrix6x3::zeros();
+        by_mounting
+            .fixed_view_mut::<3, 3>(0, 0)
+            .copy_from(&-so3::hat(&prev_from_now.translation.vector));
+        by_mounting.fixed_view_mut::<3, 3>(3, 0).copy_from(
+            &(Matrix3::identity() - prev_from_now.rotation.to_rotation_matrix().matrix()),
+        );
+        let variance = self.sigma_mounting_rad * self.sigma_mounting_rad;
+        self.cov_motion + by_mounting * by_mounting.transpose() * variance
+    }
+}
+
 /// Judges the covariances of rows whose true poses, in the frame of the odometry, are given.
 ///
-/// `truth` has one entry a row. `cov_truth_motion` is added to the covariance of each motion: that
-/// of the truth's own motion from row to row; zero for perfect truth.
+/// `truth` has one entry a row. What the truth itself may be wrong by is added to the covariance of
+/// each motion before that is judged; the accumulated pose is judged as if the truth were perfect.
 #[must_use]
 pub fn consistency(
     rows: &[OdometryRow],
     truth: &[Option<Isometry3<f64>>],
-    cov_truth_motion: &Matrix6<f64>,
+    truth_errors: &TruthErrors,
 ) -> Consistency {
     Consistency {
-        increments: judge_increments(rows, truth, cov_truth_motion),
+        increments: judge_increments(rows, truth, truth_errors),
         pose: judge_pose(rows, truth),
     }
 }
@@ -187,7 +215,7 @@ struct Sample {
 fn judge_increments(
     rows: &[OdometryRow],
     truth: &[Option<Isometry3<f64>>],
-    cov_truth_motion: &Matrix6<f64>,
+    truth_errors: &TruthErrors,
 ) -> Increments {
     let mut initializing = 0;
     let mut lost = 0;
@@ -202,7 +230,7 @@ fn judge_increments(
                 None => without_truth += 1,
                 Some(prev_from_now) => {
                     let error = error_fixed_axes(&row.prev_from_now, &prev_from_now);
-                    let cov = row.cov_motion + cov_truth_motion;
+                    let cov = row.cov_motion + truth_errors.covariance(&prev_from_now);
                     samples[i] = whiten(&error, &cov).map(|whitened| Sample {
                         error,
                         cov,

@@ -27,7 +27,7 @@ pub use trajectory::{Trajectory, read_trajectory};
 
 use crate::estimation::Status;
 use crate::output::row::OdometryRow;
-use consistency::Consistency;
+use consistency::{Consistency, TruthErrors};
 use nalgebra::{Isometry3, Matrix6, Vector6};
 use pose_errors::{AbsoluteErrors, RelativeErrors, absolute_errors, relative_errors};
 use segments::{KITTI_LENGTHS_M, SegmentReport, path_lengths_m, segment_errors};
@@ -45,8 +45,11 @@ pub struct Settings {
     pub max_difference_ns: i64,
     /// 1 σ per axis of the truth's own motion from row to row, m.
     pub truth_sigma_m: f64,
-    /// The same of its rotation, rad.
-    pub truth_sigma_rad: f64,
+    /// The same of its rotation about each axis, rad.
+    pub truth_sigma_rad: [f64; 3],
+    /// 1 σ per axis of how the truth's own sensor is turned against the camera, the same all along,
+    /// rad.
+    pub truth_sigma_mounting_rad: f64,
 }
 
 impl Default for Settings {
@@ -58,7 +61,8 @@ impl Default for Settings {
             alignments: vec![None, First, Se3, Sim3],
             max_difference_ns: 10_000_000,
             truth_sigma_m: 0.0,
-            truth_sigma_rad: 0.0,
+            truth_sigma_rad: [0.0; 3],
+            truth_sigma_mounting_rad: 0.0,
         }
     }
 }
@@ -207,12 +211,16 @@ pub fn evaluate(
         .filter_map(|(_, truth)| path_lengths_m(truth).last().copied())
         .sum();
     let truth_in_odom = truth_in_odometry_frame(estimate, truth, &found);
-    let (sigma_m, sigma_rad) = (settings.truth_sigma_m, settings.truth_sigma_rad);
-    let sigmas = Vector6::new(sigma_m, sigma_m, sigma_m, sigma_rad, sigma_rad, sigma_rad);
-    let cov_truth_motion = Matrix6::from_diagonal(&sigmas.component_mul(&sigmas));
+    let [rx, ry, rz] = settings.truth_sigma_rad;
+    let m = settings.truth_sigma_m;
+    let sigmas = Vector6::new(m, m, m, rx, ry, rz);
+    let truth_errors = TruthErrors {
+        cov_motion: Matrix6::from_diagonal(&sigmas.component_mul(&sigmas)),
+        sigma_mounting_rad: settings.truth_sigma_mounting_rad,
+    };
     let consistency = estimate
         .rows()
-        .map(|rows| consistency::consistency(rows, &truth_in_odom, &cov_truth_motion));
+        .map(|rows| consistency::consistency(rows, &truth_in_odom, &truth_errors));
     let mut evaluation = Evaluation {
         poses: estimate.len(),
         associated: paired.truth.len(),

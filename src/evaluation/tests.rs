@@ -1,6 +1,7 @@
 //! What the evaluation must say of estimates whose errors are known beforehand.
 
 use super::alignment::umeyama;
+use super::consistency::TruthErrors;
 use super::consistency::Verdict;
 use super::pose_errors::{absolute_errors, relative_errors};
 use super::segments::segment_errors;
@@ -65,6 +66,9 @@ fn row(
         variance_factor: 1.0,
         latency_ms: None,
         epoch: 0,
+        innovation_ratio: f64::NAN,
+        budget_sigmas: [0.0; 24],
+        is_first_order: true,
     }
 }
 
@@ -245,7 +249,7 @@ fn honest_covariances_are_found_consistent_and_shrunk_ones_overconfident() {
     let truth = winding(401);
     let rows = honest_run(&truth, 20);
     let truth: Vec<_> = truth.into_iter().map(Some).collect();
-    let found = consistency::consistency(&rows, &truth, &Matrix6::zeros());
+    let found = consistency::consistency(&rows, &truth, &TruthErrors::default());
     let motion = &found.increments;
     assert_eq!((motion.samples, motion.initializing), (400, 1));
     for part in [&motion.full, &motion.translation, &motion.rotation] {
@@ -263,13 +267,20 @@ fn honest_covariances_are_found_consistent_and_shrunk_ones_overconfident() {
             ..row.clone()
         })
         .collect();
-    let found = consistency::consistency(&shrunk, &truth, &Matrix6::zeros());
+    let found = consistency::consistency(&shrunk, &truth, &TruthErrors::default());
     assert_eq!(
         found.increments.full.unwrap().verdict,
         Verdict::Overconfident
     );
     // What the truth itself may err by explains the rest.
-    let found = consistency::consistency(&shrunk, &truth, &(rows[1].cov_motion * 0.5));
+    let found = consistency::consistency(
+        &shrunk,
+        &truth,
+        &TruthErrors {
+            cov_motion: rows[1].cov_motion * 0.5,
+            ..TruthErrors::default()
+        },
+    );
     assert_eq!(found.increments.full.unwrap().verdict, Verdict::Consistent);
 }
 
@@ -280,7 +291,7 @@ fn the_end_pose_of_independent_runs_is_consistent() {
     let ends: Vec<f64> = (0..300)
         .map(|seed| {
             let rows = honest_run(&truth, 1000 + seed);
-            let found = consistency::consistency(&rows, &placed, &Matrix6::zeros());
+            let found = consistency::consistency(&rows, &placed, &TruthErrors::default());
             found.pose.end.unwrap().nees
         })
         .collect();
@@ -539,4 +550,28 @@ fn the_place_of_a_camera_is_read_from_its_sensor_file() {
             "{error}"
         );
     }
+}
+
+/// The truth of a sensor that is turned against the camera: the error that it seems to show is
+/// within what its uncertain mounting allows, direction by direction.
+#[test]
+fn a_sensor_that_is_turned_errs_as_its_mounting_says() {
+    let motion = Isometry3::new(Vector3::new(0.2, -0.1, 1.2), Vector3::new(0.05, -0.2, 0.1));
+    let errors = TruthErrors {
+        sigma_mounting_rad: 1e-4,
+        ..TruthErrors::default()
+    };
+    let mut found = Matrix6::zeros();
+    for axis in 0..3 {
+        let mut turn = Vector3::zeros();
+        turn[axis] = 1e-4;
+        let turned = Isometry3::rotation(turn);
+        let error = se3::error_fixed_axes(&(turned * motion * turned.inverse()), &motion);
+        found += error * error.transpose();
+    }
+    let stated = errors.covariance(&motion);
+    assert!(
+        (found - stated).norm() < 1e-3 * stated.norm(),
+        "{found} {stated}"
+    );
 }

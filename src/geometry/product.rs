@@ -41,6 +41,24 @@ pub(crate) fn product_transposed<const R: usize, const K: usize, const C: usize>
     out
 }
 
+/// `aᵀ b`.
+#[inline]
+pub(crate) fn transposed_product<const R: usize, const K: usize, const C: usize>(
+    a: &SMatrix<f64, K, R>,
+    b: &SMatrix<f64, K, C>,
+) -> SMatrix<f64, R, C> {
+    let mut out = SMatrix::<f64, R, C>::zeros();
+    for c in 0..C {
+        for k in 0..K {
+            let factor = b.data.0[c][k];
+            for r in 0..R {
+                out.data.0[c][r] += a.data.0[r][k] * factor;
+            }
+        }
+    }
+    out
+}
+
 /// `aᵀ diag(d)`.
 #[inline]
 pub(crate) fn transposed_scaled<const R: usize, const C: usize>(
@@ -69,6 +87,7 @@ mod tests {
             let d = SMatrix::<f64, 6, 1>::from_fn(|i, _| values[i]);
             prop_assert!((product(&a, &b) - a * b).norm() < 1e-14);
             prop_assert!((product_transposed(&a, &b.transpose()) - a * b).norm() < 1e-14);
+            prop_assert!((transposed_product(&a.transpose(), &b) - a * b).norm() < 1e-14);
             prop_assert_eq!(transposed_scaled(&a, &d), a.transpose() * SMatrix::<f64, 6, 6>::from_diagonal(&d));
         }
     }

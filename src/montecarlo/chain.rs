@@ -4,7 +4,7 @@ use super::Correlation;
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::motion_chain::{ChainedTrack, MotionChain};
-use crate::estimation::track_noise::{TrackNoise, TrackNoiseMeter, TrackResidual};
+use crate::estimation::track_noise::{TrackNoise, TrackNoiseWatch};
 use crate::estimation::two_frame::{Estimator, TwoFrame, TwoFrameMotion};
 use crate::estimation::{Model, calibration, inverse_depth};
 use crate::geometry::rig_parameters::{RIG_PARAMETERS, RigCovariance};
@@ -18,13 +18,11 @@ pub struct TwoFrameChain<'a> {
     rig: &'a StereoRig,
     two_frame: TwoFrame,
     correlation: Correlation,
-    motion_freedom: f64,
-    meter: TrackNoiseMeter,
+    watch: TrackNoiseWatch,
     considered: Option<Box<RigCovariance>>,
     before: Vec<(TrackedSight, Option<Vector3<f64>>)>,
     place: Option<Place>,
     chain: MotionChain,
-    residuals: Vec<(u64, TrackResidual)>,
     ids: Vec<u64>,
     points: Vec<TrackedPoint>,
 }
@@ -51,13 +49,11 @@ impl<'a> TwoFrameChain<'a> {
             rig,
             two_frame: TwoFrame::new(estimator, model, gate_sigma2),
             correlation,
-            motion_freedom: model.degrees_of_freedom() as f64,
-            meter: TrackNoiseMeter::new(&TrackNoise::of_detector(1.0)),
+            watch: TrackNoiseWatch::new(model.degrees_of_freedom()),
             considered: None,
             before: Vec::new(),
             place: None,
             chain: MotionChain::default(),
-            residuals: Vec::new(),
             ids: Vec::new(),
             points: Vec::new(),
         }
@@ -102,31 +98,10 @@ impl<'a> TwoFrameChain<'a> {
                     ..detector
                 };
             }
-            Correlation::Measured => self.meter.age(),
+            Correlation::Measured => {}
         }
-        let residuals: Vec<(u64, TrackResidual)> = motion
-            .tracks
-            .iter()
-            .filter_map(|&i| {
-                let point = &self.points[i as usize];
-                let residual = TrackResidual::new(self.rig, &motion.reprojected, point)?;
-                Some((self.ids[i as usize], residual))
-            })
-            .collect();
-        let mut before = self.residuals.iter().peekable();
-        for (id, residual) in &residuals {
-            while before.next_if(|(other, _)| other < id).is_some() {}
-            let before = before.next_if(|(other, _)| other == id);
-            self.meter
-                .observe(before.map(|(_, before)| before), residual);
-        }
-        // The motion, too, was fitted to the residuals.
-        let count = 5.0 * residuals.len().max(2) as f64;
-        let fitted = count / (count - self.motion_freedom);
-        self.residuals = residuals;
-        let mut noise = self.meter.noise();
-        noise.variance_factor *= fitted;
-        noise
+        self.watch
+            .observe(self.rig, motion, &self.ids, &self.points)
     }
 
     /// The tracks of a motion for the chain.

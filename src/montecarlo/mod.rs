@@ -11,6 +11,7 @@
 //! | `settings` | what is simulated, checked |
 //! | `world` | landmarks and the path; their noisy sights, run by run |
 //! | `triangulation`, `motion`, `odometry` | the three stages of the thesis |
+//! | `images` | a fourth: rendered sequences through the whole pipeline |
 //! | [`estimator`] | what the odometry stage tries out: any [`FrameEstimator`] |
 //! | `chain` | such an estimator: two-frame motions, chained with their correlation |
 //! | `window` | another: the window of keyframes that the pipeline runs |
@@ -23,6 +24,7 @@ mod chain;
 mod ellipse;
 pub mod estimator;
 mod figures;
+mod images;
 mod motion;
 mod odometry;
 mod page;
@@ -37,6 +39,7 @@ mod world;
 
 pub use chain::TwoFrameChain;
 pub use estimator::{FrameEstimate, FrameEstimator, TrackedSight};
+pub use images::{ImagesOutcome, SEQUENCES, Sequence, run_images};
 pub use motion::{MotionOutcome, run_motion};
 pub use odometry::{OdometryOutcome, run_odometry, run_odometry_with};
 pub use page::{FigureFile, figure_files};

@@ -7,6 +7,7 @@ use super::{
     rng_of_run,
 };
 use crate::estimation;
+use crate::estimation::two_frame::Estimator;
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{Isometry3, Vector6};
 
@@ -90,7 +91,27 @@ impl Settings {
     pub(super) fn window(&self) -> estimation::Settings {
         estimation::Settings {
             min_inliers: 6,
+            // A rig that states its errors is as uncertain as that; else it is exact.
             calibration_sigma_px: 0.0,
+            consider_calibration: self.rig_error == RigError::Considered,
+            gate_sigma2: self.gate_sigma2,
+            ..estimation::Settings::default()
+        }
+    }
+
+    /// The whole pipeline's settings for images.
+    pub(super) fn of_images(&self) -> estimation::Settings {
+        let method = match self.estimator {
+            _ if self.windowed => estimation::Method::Window,
+            Estimator::Svd => estimation::Method::Svd,
+            Estimator::Weighted => estimation::Method::Weighted,
+            Estimator::Bundle => estimation::Method::Bundle,
+        };
+        estimation::Settings {
+            method,
+            model: self.model,
+            calibration_sigma_px: 0.0,
+            consider_calibration: self.rig_error == RigError::Considered,
             gate_sigma2: self.gate_sigma2,
             ..estimation::Settings::default()
         }

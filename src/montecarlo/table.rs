@@ -1,7 +1,7 @@
 //! Outcomes in, a table for a person and a CSV file out.
 
 use super::verdict::{LEVEL, Part};
-use super::{MotionOutcome, OdometryOutcome, TriangulationOutcome, Verdict};
+use super::{ImagesOutcome, MotionOutcome, OdometryOutcome, TriangulationOutcome, Verdict};
 use std::fmt::Write as _;
 
 /// What the three stages found, as far as they were run.
@@ -13,6 +13,8 @@ pub struct Outcomes {
     pub motion: Option<MotionOutcome>,
     /// Motions to a path.
     pub odometry: Option<OdometryOutcome>,
+    /// Images to a path.
+    pub images: Option<ImagesOutcome>,
 }
 
 /// One verdict with its name.
@@ -53,6 +55,16 @@ fn rows(outcomes: &Outcomes) -> Vec<Row<'_>> {
             rows.push(Row {
                 stage: "pose",
                 at: (k + 1).to_string(),
+                verdict,
+                failed: o.failed,
+            });
+        }
+    }
+    if let Some(o) = &outcomes.images {
+        for (stage, verdict) in [("image increment", &o.increments), ("image pose", &o.last)] {
+            rows.push(Row {
+                stage,
+                at: String::new(),
                 verdict,
                 failed: o.failed,
             });
@@ -144,7 +156,15 @@ pub fn to_json(outcomes: &Outcomes) -> serde_json::Result<String> {
         translation_m: row.verdict.translation(),
         rotation_rad: row.verdict.rotation(),
     });
-    serde_json::to_string_pretty(&objects.collect::<Vec<_>>())
+    let objects: Vec<_> = objects.collect();
+    match &outcomes.images {
+        None => serde_json::to_string_pretty(&objects),
+        Some(images) => serde_json::to_string_pretty(&serde_json::json!({
+            "verdicts": objects,
+            "sequences": images.sequences,
+            "whiteness": { "autocorrelation": images.whiteness.0, "limit": images.whiteness.1 },
+        })),
+    }
 }
 
 /// The table for a person: points, motion, increments, and some of the path's poses.
@@ -173,7 +193,36 @@ pub fn summary_text(outcomes: &Outcomes) -> String {
          above is overconfident, below pessimistic.",
         100.0 * LEVEL
     );
+    if let Some(o) = &outcomes.images {
+        push_sequences(&mut out, o);
+    }
     out
+}
+
+/// Sequence by sequence, and how far neighbouring motions share errors.
+fn push_sequences(out: &mut String, o: &ImagesOutcome) {
+    let _ = writeln!(
+        out,
+        "\n{:<22} {:>6} {:>8} {:>5}  {:>16}  {:>11}",
+        "sequence", "seed", "motions", "lost", "ANEES of motions", "NEES/6 end"
+    );
+    for s in &o.sequences {
+        let _ = writeln!(
+            out,
+            "{:<22} {:>6} {:>8} {:>5}  {:>16.3}  {:>11.3}",
+            format!("{}, {}", s.scene, s.trajectory),
+            s.seed,
+            s.motions,
+            s.lost,
+            s.anees_of_motions,
+            s.nees_of_end
+        );
+    }
+    let (found, limit) = o.whiteness;
+    let _ = writeln!(
+        out,
+        "whiteness of motions: lag-1 autocorrelation {found:+.3}, ±{limit:.3} if they were independent"
+    );
 }
 
 /// A path's poses that are worth a line: the first, some on the way, the last.
@@ -191,6 +240,8 @@ fn push_line(out: &mut String, row: &Row<'_>) {
         ),
         "pose" => format!("pose after {} motions", row.at),
         "increment" => "motions of the path".to_owned(),
+        "image increment" => "motions, from images".to_owned(),
+        "image pose" => "last pose, from images".to_owned(),
         other => other.to_owned(),
     };
     let part = |p: Option<Part>, per: f64| {

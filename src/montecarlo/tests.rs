@@ -6,7 +6,7 @@ use crate::estimation::MotionModel;
 use crate::estimation::two_frame::Estimator;
 use crate::geometry::rig_parameters::{CAMERA_PARAMETERS, RigCovariance};
 use crate::geometry::{RigUncertainty, StereoRig};
-use crate::simulation::{points::PixelNoise, thesis_rig};
+use crate::simulation::{points::PixelNoise, small_rig, thesis_rig};
 use crate::uncertainty::consistency::{anees_interval, coverage_interval};
 
 fn silent(_: u64) {}
@@ -248,6 +248,57 @@ fn a_disparity_that_is_off_everywhere_is_covered_where_it_is_considered() {
     assert!(ignored > 1.6, "{ignored}");
 }
 
+/// All parameters, and those that the warp cannot describe alone: a rig that states four sigmas.
+#[test]
+fn a_rig_that_is_off_is_covered_by_the_window_and_nothing_counts_twice() {
+    let stated = StereoRig {
+        uncertainty: Some(RigUncertainty::Sigmas {
+            focal_px: 1.0,
+            principal_point_px: 0.3,
+            rotation_rad: 2e-4,
+            translation_m: 5e-4,
+        }),
+        ..thesis_rig()
+    };
+    for rig in [uncertain_rig(), stated] {
+        let settings = Settings {
+            rig_error: RigError::Considered,
+            windowed: true,
+            runs: 60,
+            steps: 25,
+            features: 60,
+            ..Settings::default()
+        };
+        let outcome = run_odometry(&rig, &settings, &silent).expect("determined");
+        let (low, high) = anees_interval(6, 60, 0.997);
+        let anees = outcome.last().anees;
+        assert!((low..high).contains(&anees), "{anees}");
+        // Motions of one run share its rig: as many samples as runs.
+        let anees = outcome.increments.anees;
+        assert!((low..high).contains(&anees), "{anees}");
+    }
+}
+
+/// Two short sequences: the whole pipeline's covariances are of the right size. What they are worth in
+/// the long run stands in COVARIANCE.md.
+#[test]
+fn rendered_sequences_err_as_their_covariances_say() {
+    let settings = Settings {
+        runs: 4,
+        steps: 12,
+        windowed: true,
+        ..Settings::default()
+    };
+    let outcome = run_images(&small_rig(), &settings, &silent).expect("followed");
+    assert_eq!(outcome.failed, 0);
+    assert_eq!(outcome.increments.runs, 48);
+    let anees = outcome.increments.anees;
+    assert!((0.5..1.8).contains(&anees), "{anees}");
+    assert!(outcome.last.anees < 3.0, "{}", outcome.last.anees);
+    let again = run_images(&small_rig(), &settings, &silent).expect("followed");
+    assert_eq!(again.sequences, outcome.sequences);
+}
+
 #[test]
 fn points_of_an_uncertain_rig_are_covered() {
     let settings = Settings {
@@ -284,6 +335,7 @@ fn threads_do_not_change_a_bit() {
                 odometry: Some(
                     run_odometry(&thesis_rig(), &settings, &silent).expect("determined"),
                 ),
+                images: None,
             };
             (to_csv(&outcomes), figure_files(&outcomes, &settings))
         })
@@ -344,6 +396,7 @@ fn every_figure_is_a_whole_document_without_anything_from_outside() {
         triangulation: Some(run_triangulation(&thesis_rig(), &settings, &silent).expect("seen")),
         motion: Some(run_motion(&thesis_rig(), &settings, &silent).expect("determined")),
         odometry: Some(run_odometry(&thesis_rig(), &settings, &silent).expect("determined")),
+        images: None,
     };
     let files = figure_files(&outcomes, &settings);
     assert_eq!(files.len(), 7);

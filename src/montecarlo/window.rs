@@ -2,6 +2,7 @@
 
 use super::estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 use crate::estimation::Settings;
+use crate::estimation::sources::{BySources, RigErrors};
 use crate::estimation::window::{Seen, Window};
 use crate::geometry::StereoRig;
 use nalgebra::{Isometry3, Matrix6};
@@ -9,6 +10,7 @@ use nalgebra::{Isometry3, Matrix6};
 /// The estimator that the pipeline runs, on points instead of images.
 pub struct WindowOdometry {
     window: Window,
+    errors: RigErrors,
     pairs: u64,
     predicted: Isometry3<f64>,
     known: Vec<Seen>,
@@ -25,6 +27,7 @@ impl WindowOdometry {
     pub fn new(rig: &StereoRig, settings: &Settings) -> Self {
         Self {
             window: Window::new(rig.clone(), settings.clone()),
+            errors: RigErrors::of(rig, settings),
             pairs: 0,
             predicted: Isometry3::identity(),
             known: Vec::new(),
@@ -51,7 +54,8 @@ impl FrameEstimator for WindowOdometry {
         self.pairs += 1;
         if self.pairs == 1 {
             let cov = Matrix6::identity() * ORIGIN_VARIANCE;
-            self.window.begin_at(&Isometry3::identity(), &cov);
+            self.window
+                .begin_at(&Isometry3::identity(), &cov, &BySources::zeros());
             self.window.promote(&self.new);
             return Some(FrameEstimate {
                 prev_from_now: Isometry3::identity(),
@@ -75,11 +79,12 @@ impl FrameEstimator for WindowOdometry {
         self.window.settle();
         self.window.promote(&self.new);
         self.predicted = tracked.motion.prev_from_now;
+        let total = |cov: &Matrix6<f64>, by: &BySources| self.errors.apart(cov, by).total();
         Some(FrameEstimate {
             prev_from_now: tracked.motion.prev_from_now,
-            cov_motion: tracked.motion.cov_right,
+            cov_motion: total(&tracked.motion.cov_right, &tracked.motion_by_sources),
             odom_from_camera: tracked.odom_from_now,
-            cov_pose: tracked.cov_pose_right,
+            cov_pose: total(&tracked.cov_pose_right, &tracked.pose_by_sources),
         })
     }
 }

@@ -13,11 +13,11 @@ use std::io::{self, BufWriter, Read, Write};
 use std::path::{Path, PathBuf};
 
 /// Columns that a file must have.
-const REQUIRED: usize = HEADER.len() - 1;
+const REQUIRED: usize = 66;
 
-/// The columns, in order; those from the last on may be missing in a file.
+/// The columns, in order; those from `epoch` on may be missing in a file.
 #[rustfmt::skip]
-pub const HEADER: [&str; 67] = [
+pub const HEADER: [&str; 93] = [
     "seq", "timestamp_ns", "status",
     "tx", "ty", "tz", "qx", "qy", "qz", "qw",
     "c00", "c01", "c02", "c03", "c04", "c05", "c11", "c12", "c13", "c14", "c15",
@@ -27,7 +27,16 @@ pub const HEADER: [&str; 67] = [
     "m22", "m23", "m24", "m25", "m33", "m34", "m35", "m44", "m45", "m55",
     "keypoints_left", "keypoints_right", "stereo_matches", "tracks", "inliers",
     "variance_factor", "latency_ms",
-    "epoch",
+    "epoch", "innovation_ratio",
+    "sigma_detection_x", "sigma_detection_y", "sigma_detection_z",
+    "sigma_detection_rx", "sigma_detection_ry", "sigma_detection_rz",
+    "sigma_calibration_x", "sigma_calibration_y", "sigma_calibration_z",
+    "sigma_calibration_rx", "sigma_calibration_ry", "sigma_calibration_rz",
+    "sigma_synchronisation_x", "sigma_synchronisation_y", "sigma_synchronisation_z",
+    "sigma_synchronisation_rx", "sigma_synchronisation_ry", "sigma_synchronisation_rz",
+    "sigma_bridging_x", "sigma_bridging_y", "sigma_bridging_z",
+    "sigma_bridging_rx", "sigma_bridging_ry", "sigma_bridging_rz",
+    "first_order",
 ];
 
 /// The header line, without its end.
@@ -254,6 +263,19 @@ impl Record<'_> {
                 Some(_) => self.parse(66, "a whole number")?,
                 None => 0,
             },
+            innovation_ratio: match self.columns[67] {
+                Some(_) => self.number(67)?,
+                None => f64::NAN,
+            },
+            budget_sigmas: if (68..92).all(|column| self.columns[column].is_some()) {
+                self.finite_numbers(68)?
+            } else {
+                [0.0; 24]
+            },
+            is_first_order: match self.columns[92] {
+                Some(_) => self.parse::<u8>(92, "0 or 1")? != 0,
+                None => true,
+            },
         })
     }
 
@@ -373,7 +395,12 @@ mod tests {
             mtx,mty,mtz,mqx,mqy,mqz,mqw,\
             m00,m01,m02,m03,m04,m05,m11,m12,m13,m14,m15,m22,m23,m24,m25,m33,m34,m35,m44,m45,m55,\
             keypoints_left,keypoints_right,stereo_matches,tracks,inliers,variance_factor,\
-            latency_ms,epoch";
+            latency_ms,epoch,innovation_ratio,\
+            sigma_detection_x,sigma_detection_y,sigma_detection_z,sigma_detection_rx,sigma_detection_ry,sigma_detection_rz,\
+            sigma_calibration_x,sigma_calibration_y,sigma_calibration_z,sigma_calibration_rx,sigma_calibration_ry,sigma_calibration_rz,\
+            sigma_synchronisation_x,sigma_synchronisation_y,sigma_synchronisation_z,sigma_synchronisation_rx,sigma_synchronisation_ry,sigma_synchronisation_rz,\
+            sigma_bridging_x,sigma_bridging_y,sigma_bridging_z,sigma_bridging_rx,sigma_bridging_ry,sigma_bridging_rz,\
+            first_order";
         assert_eq!(header_line(), expected);
         let mut names = Vec::new();
         OdometryRow::new(&sample_odometry(0), None).for_each(|name, _| names.push(name.to_owned()));
@@ -421,7 +448,7 @@ mod tests {
         );
         assert_eq!(
             message(text.trim_end().rsplit_once(',').unwrap().0),
-            "o.csv:4: has 66 fields, but the header has 67"
+            "o.csv:4: has 92 fields, but the header has 93"
         );
         assert!(message("").contains("o.csv:1: seq: is missing"));
         assert!(

@@ -150,7 +150,10 @@ mod tests {
                 parsed["budget"]["detection"][20].as_f64(),
                 Some(odometry.budget.detection[(5, 5)])
             );
-            prop_assert!(parsed["budget"]["calibration"].is_null());
+            prop_assert_eq!(
+                parsed["budget"]["calibration"][0].as_f64(),
+                Some(odometry.budget.calibration[(0, 0)])
+            );
             prop_assert!(parsed["latencies_ns"]["total"].is_null());
             prop_assert_eq!(parsed["received_monotonic_ns"].as_i64(), Some(9));
         }

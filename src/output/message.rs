@@ -45,7 +45,7 @@
 //! | 1816 | `u64` | `latency_matching_ns` | left–right and over time |
 //! | 1824 | `u64` | `latency_estimation_ns` | triangulation to pose |
 //! | 1832 | `u64` | `latency_total_ns` | pair complete to message ready |
-//! | 1840 | `u64` | `reserved_2` | 0 |
+//! | 1840 | `f64` | `innovation_ratio` | of the noise model: below 0.5 fine, above 1 it does not hold; not a number where nothing was measured |
 //!
 //! Covariances are ordered x, y, z, rx, ry, rz (m², m·rad, rad²) with the conventions of
 //! [`Odometry`]: about the fixed axes of the odometry frame for the pose. The parts of the error
@@ -69,6 +69,8 @@ pub mod flags {
     pub const REPLAY: u32 = 1;
     /// `monotonic_ns` holds the capture time.
     pub const MONOTONIC: u32 = 2;
+    /// The rotation is so uncertain that the covariance does not describe the pose's error any more.
+    pub const BEYOND_FIRST_ORDER: u32 = 4;
 }
 
 /// Bits of `budget_modelled`.
@@ -81,6 +83,8 @@ pub mod budget_parts {
     pub const SYNCHRONISATION: u32 = 4;
     /// From motions that had to be bridged.
     pub const BRIDGING: u32 = 8;
+    /// All of them.
+    pub const ALL: u32 = DETECTION | CALIBRATION | SYNCHRONISATION | BRIDGING;
 }
 
 /// Whose pose a message holds.
@@ -168,7 +172,7 @@ pub struct OdometryMessage {
     pub latency_matching_ns: u64,
     pub latency_estimation_ns: u64,
     pub latency_total_ns: u64,
-    pub reserved_2: u64,
+    pub innovation_ratio: f64,
 }
 
 /// Why a message cannot be used.
@@ -230,11 +234,16 @@ impl OdometryMessage {
             } => (flags::MONOTONIC, realtime_ns, monotonic_ns),
             CaptureTime::Recorded(stamp_ns) => (flags::REPLAY, stamp_ns, 0),
         };
+        let beyond_first_order = if odometry.is_first_order() {
+            0
+        } else {
+            flags::BEYOND_FIRST_ORDER
+        };
         Self {
             magic: ODOMETRY_MAGIC,
             version: ODOMETRY_VERSION,
             size: SIZE,
-            flags,
+            flags: flags | beyond_first_order,
             sequence: odometry.sequence,
             message_number: 0,
             realtime_ns,
@@ -243,7 +252,7 @@ impl OdometryMessage {
             epoch: odometry.epoch,
             status: status_code(odometry.status),
             frame: u32::from(in_base.is_some()),
-            budget_modelled: budget_parts::DETECTION | budget_parts::BRIDGING,
+            budget_modelled: budget_parts::ALL,
             keypoints_left: odometry.counts.keypoints_left,
             keypoints_right: odometry.counts.keypoints_right,
             stereo_matches: odometry.counts.stereo_matches,
@@ -260,15 +269,15 @@ impl OdometryMessage {
             cov_motion: rows(&odometry.cov_motion),
             cov_twist: rows(&odometry.cov_twist),
             budget_detection: upper_triangle(&odometry.budget.detection),
-            budget_calibration: [0.0; 21],
-            budget_synchronisation: [0.0; 21],
+            budget_calibration: upper_triangle(&odometry.budget.calibration),
+            budget_synchronisation: upper_triangle(&odometry.budget.synchronisation),
             budget_bridging: upper_triangle(&odometry.budget.bridging),
             latency_capture_ns: latencies.capture_ns,
             latency_features_ns: latencies.features_ns,
             latency_matching_ns: latencies.matching_ns,
             latency_estimation_ns: latencies.estimation_ns,
             latency_total_ns: latencies.total_ns,
-            reserved_2: 0,
+            innovation_ratio: odometry.innovation_ratio,
         }
     }
 
@@ -490,7 +499,7 @@ pub(super) mod tests {
             position_m orientation_xyzw motion_translation_m motion_rotation_xyzw twist cov_pose
             cov_motion cov_twist budget_detection budget_calibration budget_synchronisation
             budget_bridging latency_capture_ns latency_features_ns latency_matching_ns
-            latency_estimation_ns latency_total_ns reserved_2);
+            latency_estimation_ns latency_total_ns innovation_ratio);
         let names: Vec<_> = documented.iter().map(|(o, _, f)| (*o, *f)).collect();
         assert_eq!(names, actual);
         assert_gapless(&documented, size_of::<OdometryMessage>());

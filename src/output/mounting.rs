@@ -27,6 +27,8 @@ pub fn in_base_frame(camera: &Odometry, base_from_camera: &Isometry3<f64>) -> Od
         cov_twist: carry(&by_twist, &camera.cov_twist),
         budget: ErrorBudget {
             detection: carry(&by_pose, &camera.budget.detection),
+            calibration: carry(&by_pose, &camera.budget.calibration),
+            synchronisation: carry(&by_pose, &camera.budget.synchronisation),
             bridging: carry(&by_pose, &camera.budget.bridging),
         },
         ..camera.clone()

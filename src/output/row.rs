@@ -1,6 +1,6 @@
 //! An estimate or a message in, named columns out: what the odometry CSV and `listen --json` share.
 
-use super::message::OdometryMessage;
+use super::message::{OdometryMessage, flags};
 use crate::estimation::{Counts, Odometry, Status};
 use nalgebra::{Isometry3, Matrix6, Quaternion, Translation3, UnitQuaternion};
 
@@ -30,6 +30,14 @@ pub struct OdometryRow {
     pub latency_ms: Option<f64>,
     /// Rises whenever the odometry frame begins anew.
     pub epoch: u32,
+    /// Of the noise model: below 0.5 it is fine, above 1 it does not hold; not a number where nothing
+    /// was measured.
+    pub innovation_ratio: f64,
+    /// 1 σ that each part of the error budget gives the pose, m and rad: x, y, z, rx, ry, rz by
+    /// detection, then by calibration, synchronisation and bridging.
+    pub budget_sigmas: [f64; 24],
+    /// Whether the covariance describes the pose's error, to first order.
+    pub is_first_order: bool,
 }
 
 /// One value of a row.
@@ -42,6 +50,22 @@ pub enum Value {
     /// A number.
     Float(f64),
 }
+
+/// Names of the columns of [`OdometryRow::budget_sigmas`].
+#[rustfmt::skip]
+pub const BUDGET_COLUMNS: [&str; 24] = [
+    "sigma_detection_x", "sigma_detection_y", "sigma_detection_z",
+    "sigma_detection_rx", "sigma_detection_ry", "sigma_detection_rz",
+    "sigma_calibration_x", "sigma_calibration_y", "sigma_calibration_z",
+    "sigma_calibration_rx", "sigma_calibration_ry", "sigma_calibration_rz",
+    "sigma_synchronisation_x", "sigma_synchronisation_y", "sigma_synchronisation_z",
+    "sigma_synchronisation_rx", "sigma_synchronisation_ry", "sigma_synchronisation_rz",
+    "sigma_bridging_x", "sigma_bridging_y", "sigma_bridging_z",
+    "sigma_bridging_rx", "sigma_bridging_ry", "sigma_bridging_rz",
+];
+
+/// Where the diagonal stands in an upper triangle.
+const DIAGONAL: [usize; 6] = [0, 6, 11, 15, 18, 20];
 
 /// Names of the upper triangle's entries after their first letter, row by row.
 const TRIANGLE: [&str; 21] = [
@@ -65,6 +89,14 @@ impl OdometryRow {
             variance_factor: odometry.variance_factor,
             latency_ms,
             epoch: odometry.epoch,
+            innovation_ratio: odometry.innovation_ratio,
+            budget_sigmas: sigmas(
+                odometry
+                    .budget
+                    .parts()
+                    .map(|(_, part)| std::array::from_fn(|i| part[(i, i)])),
+            ),
+            is_first_order: odometry.is_first_order(),
         }
     }
 
@@ -91,6 +123,13 @@ impl OdometryRow {
             variance_factor: message.variance_factor,
             latency_ms: (total_ns > 0 && !message.is_replay()).then(|| latency_ms(total_ns)),
             epoch: message.epoch,
+            innovation_ratio: message.innovation_ratio,
+            budget_sigmas: sigmas(
+                message
+                    .budget()
+                    .map(|(_, _, part)| DIAGONAL.map(|i| part[i])),
+            ),
+            is_first_order: message.flags & flags::BEYOND_FIRST_ORDER == 0,
         })
     }
 
@@ -113,7 +152,18 @@ impl OdometryRow {
         column("variance_factor", Float(self.variance_factor));
         column("latency_ms", Float(self.latency_ms.unwrap_or(f64::NAN)));
         column("epoch", Integer(self.epoch.into()));
+        column("innovation_ratio", Float(self.innovation_ratio));
+        for (name, sigma) in BUDGET_COLUMNS.into_iter().zip(self.budget_sigmas) {
+            column(name, Float(sigma));
+        }
+        column("first_order", Integer(i128::from(self.is_first_order)));
     }
+}
+
+/// Standard deviations from the variances of each part of the budget.
+fn sigmas(parts: [[f64; 6]; 4]) -> [f64; 24] {
+    let mut variances = parts.into_iter().flatten();
+    std::array::from_fn(|_| variances.next().map_or(0.0, |v| v.max(0.0).sqrt()))
 }
 
 /// Nanoseconds as the milliseconds of `latency_ms`.
@@ -234,19 +284,21 @@ pub(crate) mod tests {
             (odom_from_camera, prev_from_now) in (any_isometry(), any_isometry()),
             (cov_pose, cov_motion, cov_twist) in (any_symmetric(), any_symmetric(), any_symmetric()),
             twist in prop::array::uniform6(-4.0..4.0_f64),
-            (detection, bridging) in (any_symmetric(), any_symmetric()),
+            (detection, calibration) in (any_symmetric(), any_symmetric()),
+            (synchronisation, bridging) in (any_symmetric(), any_symmetric()),
             n in any::<[u32; 5]>(),
-            variance_factor in any_finite(),
+            (variance_factor, innovation_ratio) in (any_finite(), any_finite()),
         ) -> Odometry {
             Odometry {
                 sequence, timestamp_ns, epoch, status, odom_from_camera, cov_pose, prev_from_now,
                 cov_motion, twist: Vector6::from(twist), cov_twist,
-                budget: ErrorBudget { detection, bridging },
+                budget: ErrorBudget { detection, calibration, synchronisation, bridging },
                 counts: Counts {
                     keypoints_left: n[0], keypoints_right: n[1], stereo_matches: n[2],
                     tracks: n[3], inliers: n[4],
                 },
                 variance_factor,
+                innovation_ratio,
             }
         }
     }
@@ -271,6 +323,8 @@ pub(crate) mod tests {
             cov_twist: spread * 3.0,
             budget: ErrorBudget {
                 detection: spread * (1.0 + s),
+                calibration: spread * 0.1,
+                synchronisation: Matrix6::zeros(),
                 bridging: Matrix6::zeros(),
             },
             counts: Counts {
@@ -281,6 +335,7 @@ pub(crate) mod tests {
                 inliers: 260,
             },
             variance_factor: 1.0 / 3.0,
+            innovation_ratio: 0.2,
         }
     }
 

@@ -7,6 +7,7 @@
 use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
+use crate::estimation::sources::{Exposure, RigErrors};
 use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement};
 use crate::features::Features;
 use crate::geometry::{Rectification, StereoRig};
@@ -14,8 +15,10 @@ use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
 };
 use crate::refinement::{Pyramid, PyramidPair};
-use nalgebra::{Vector3, Vector4};
+use nalgebra::{Isometry3, Vector3, Vector4};
 use std::time::{Duration, Instant};
+
+const NS_PER_S: f64 = 1e9;
 
 /// What is known of one image.
 #[derive(Clone, Debug, Default)]
@@ -87,6 +90,9 @@ pub(super) struct Workbench {
     pub(super) predicted: Vec<Option<Vector4<f64>>>,
     pub(super) tracks: Vec<Track>,
     pub(super) odometer: Option<Odometer>,
+    pub(super) errors: RigErrors,
+    /// How the present images were taken.
+    pub(super) exposure: Exposure,
     /// When matching was done and estimation began.
     pub(super) matched: Option<Instant>,
 }
@@ -117,9 +123,11 @@ impl Method {
             estimation::Method::Window => {
                 Estimator::Window(Box::new(Windowed::new(&rig, &estimation)))
             }
-            _ => Estimator::TwoFrame(Box::default()),
+            _ => Estimator::TwoFrame(Box::new(TwoFrame::new(&rig, &estimation))),
         };
         let bench = Workbench {
+            errors: RigErrors::of(&rig, &estimation),
+            exposure: Exposure::default(),
             rig,
             stereo_matcher: StereoMatcher::new(matching.clone(), rectification),
             temporal_matcher: TemporalMatcher::new(matching.clone()),
@@ -148,6 +156,7 @@ impl Method {
         let started = Instant::now();
         self.bench.matched = None;
         self.bench.match_left_and_right()?;
+        self.bench.exposure = self.bench.exposure();
         self.bench.triangulate();
         let row = match &mut self.estimator {
             Estimator::TwoFrame(estimator) => estimator.step(&mut self.bench)?,
@@ -167,9 +176,10 @@ impl Method {
         match &mut self.bench.odometer {
             Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
             Some(odometer) => odometer.begin(stamp, Counts::default()),
-            None => {
-                Odometer::new(self.bench.estimation.clone(), stamp).begin(stamp, Counts::default())
-            }
+            None => self
+                .bench
+                .new_odometer(stamp)
+                .begin(stamp, Counts::default()),
         }
     }
 
@@ -200,12 +210,35 @@ impl Workbench {
         } = &mut self.now;
         measurements.clear();
         measurements.extend(matches.iter().map(|m| measurement(pair, *m)));
+        if self.exposure.skew_s != 0.0 {
+            // As they would have been seen at the left image's time.
+            let identity = Isometry3::identity();
+            for m in measurements.iter_mut() {
+                if let Some(y) = estimation::inverse_depth(&self.rig, m) {
+                    m.px -= self.exposure.displacement(&self.rig, &identity, &y);
+                }
+            }
+        }
         inverse_depths.clear();
         inverse_depths.extend(
             measurements
                 .iter()
                 .map(|m| estimation::inverse_depth(&self.rig, m)),
         );
+    }
+
+    /// How the present images were taken, as far as the last velocity tells.
+    fn exposure(&self) -> Exposure {
+        let skew = &self.now.pair.skew;
+        let (skew_s, sigma_s) = (skew.ns as f64 / NS_PER_S, skew.sigma_ns / NS_PER_S);
+        self.odometer
+            .as_ref()
+            .map_or_else(Exposure::default, |o| o.exposure(skew_s, sigma_s))
+    }
+
+    /// An odometer that begins with a pair.
+    pub(super) fn new_odometer(&self, stamp: PairStamp) -> Odometer {
+        Odometer::new(self.estimation.clone(), self.errors.clone(), stamp)
     }
 
     pub(super) fn counts(&self, inliers: u32) -> Counts {

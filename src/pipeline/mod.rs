@@ -1,6 +1,8 @@
 //! Pipeline: the method itself, and the threads that carry pairs through it.
 
 mod driver;
+#[cfg(test)]
+mod estimator_tests;
 mod gallery;
 mod histogram;
 mod method;

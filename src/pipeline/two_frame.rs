@@ -2,28 +2,53 @@
 //! that look at two pairs only.
 
 use super::method::{Seen, Workbench};
-use crate::estimation::bundle::{Adjuster, TrackedPoint};
-use crate::estimation::{self, MeasuredMotion, Odometer, Odometry, Status};
+use crate::estimation::bundle::TrackedPoint;
+use crate::estimation::sources::Exposure;
+use crate::estimation::{
+    self, MeasuredMotion, MotionMeter, MotionTracks, Odometer, Odometry, Settings, Status,
+};
+use crate::geometry::StereoRig;
 use crate::matching::MatchError;
 use nalgebra::Isometry3;
 use std::time::Instant;
 
 /// The state between pairs.
-#[derive(Default)]
 pub(super) struct TwoFrame {
     reference: Seen,
+    /// The track of each of the reference's stereo matches.
+    reference_ids: Vec<u64>,
+    reference_exposure: Exposure,
+    next_id: u64,
+    now_ids: Vec<u64>,
+    tracked: Vec<(u64, TrackedPoint)>,
+    ids: Vec<u64>,
     points: Vec<TrackedPoint>,
-    adjuster: Adjuster,
+    meter: MotionMeter,
 }
 
 impl TwoFrame {
+    pub(super) fn new(rig: &StereoRig, settings: &Settings) -> Self {
+        Self {
+            reference: Seen::default(),
+            reference_ids: Vec::new(),
+            reference_exposure: Exposure::default(),
+            next_id: 0,
+            now_ids: Vec::new(),
+            tracked: Vec::new(),
+            ids: Vec::new(),
+            points: Vec::new(),
+            meter: MotionMeter::new(rig, settings),
+        }
+    }
+
     pub(super) fn step(&mut self, bench: &mut Workbench) -> Result<Odometry, MatchError> {
         let stamp = bench.now.pair.stamp();
         let Some(mut odometer) = bench.odometer.take() else {
-            let mut odometer = Odometer::new(bench.estimation.clone(), stamp);
+            let mut odometer = bench.new_odometer(stamp);
             let row = odometer.begin(stamp, bench.counts(0));
+            self.become_reference(bench);
+            self.meter.begin(&odometer.last_place().cov);
             bench.odometer = Some(odometer);
-            std::mem::swap(&mut self.reference, &mut bench.now);
             return Ok(row);
         };
         let predicted = odometer.predict(stamp.timestamp_ns);
@@ -36,7 +61,7 @@ impl TwoFrame {
         let measured = self.measure_motion(bench, &odometer, &predicted);
         let counts = bench.counts(measured.as_ref().map_or(0, |m| m.inliers));
         let row = match &measured {
-            Some(motion) => odometer.advance(stamp, motion, counts),
+            Some(motion) => odometer.advance(stamp, motion, self.meter.cov_chained(), counts),
             None if !odometer.has_tracked() && self.is_better_start(bench) => {
                 odometer.begin(stamp, counts)
             }
@@ -44,10 +69,32 @@ impl TwoFrame {
             None => odometer.bridge(stamp, counts),
         };
         if row.status != Status::Lost {
-            std::mem::swap(&mut self.reference, &mut bench.now);
+            self.become_reference(bench);
+        }
+        if row.status == Status::Initializing {
+            self.meter.begin(&odometer.last_place().cov);
         }
         bench.odometer = Some(odometer);
         Ok(row)
+    }
+
+    /// Makes the present pair the reference; tracks keep their numbers.
+    fn become_reference(&mut self, bench: &mut Workbench) {
+        self.now_ids.clear();
+        let first = self.next_id;
+        self.now_ids.extend((first..).take(bench.now.matches.len()));
+        self.next_id = first + bench.now.matches.len() as u64;
+        for track in &bench.tracks {
+            let (before, now) = (track.before as usize, track.now as usize);
+            if let (Some(id), Some(slot)) =
+                (self.reference_ids.get(before), self.now_ids.get_mut(now))
+            {
+                *slot = *id;
+            }
+        }
+        std::mem::swap(&mut self.reference_ids, &mut self.now_ids);
+        self.reference_exposure = bench.exposure;
+        std::mem::swap(&mut self.reference, &mut bench.now);
     }
 
     /// Tracks from the reference to now: first near the prediction, then, if that finds too few,
@@ -97,25 +144,35 @@ impl TwoFrame {
         odometer: &Odometer,
         predicted: &Isometry3<f64>,
     ) -> Option<MeasuredMotion> {
-        self.points.clear();
+        self.tracked.clear();
         for track in &bench.tracks {
-            let Some(inverse_depth) = self.reference.inverse_depths[track.before as usize] else {
+            let before = track.before as usize;
+            let Some(inverse_depth) = self.reference.inverse_depths[before] else {
                 continue;
             };
-            self.points.push(TrackedPoint {
-                prev: self.reference.measurements[track.before as usize],
+            let point = TrackedPoint {
+                prev: self.reference.measurements[before],
                 now: bench.now.measurements[track.now as usize],
                 inverse_depth,
-            });
+            };
+            self.tracked.push((self.reference_ids[before], point));
         }
-        estimation::measure(
+        self.tracked.sort_unstable_by_key(|(id, _)| *id);
+        self.ids.clear();
+        self.ids.extend(self.tracked.iter().map(|(id, _)| *id));
+        self.points.clear();
+        self.points
+            .extend(self.tracked.iter().map(|(_, point)| *point));
+        self.meter.measure(
             &bench.rig,
-            &self.points,
-            Some(predicted),
+            &MotionTracks {
+                ids: &self.ids,
+                points: &self.points,
+                exposures: [self.reference_exposure, bench.exposure],
+            },
+            predicted,
             odometer.expected_variance_factor(),
             bench.estimation.seed ^ bench.now.pair.sequence,
-            &bench.estimation,
-            &mut self.adjuster,
         )
     }
 

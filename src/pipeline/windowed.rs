@@ -69,7 +69,7 @@ impl Windowed {
     pub(super) fn step(&mut self, bench: &mut Workbench) -> Result<Odometry, MatchError> {
         let stamp = bench.now.pair.stamp();
         let Some(mut odometer) = bench.odometer.take() else {
-            let mut odometer = Odometer::new(bench.estimation.clone(), stamp);
+            let mut odometer = bench.new_odometer(stamp);
             let row = odometer.begin(stamp, bench.counts(0));
             self.begin(bench, &odometer);
             bench.odometer = Some(odometer);
@@ -98,6 +98,7 @@ impl Windowed {
             self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());
             self.window.add(&newest_from_now, &self.seen);
+            self.window.expose(&bench.exposure);
             self.window.adjust()
         });
         let Some(tracked) = tracked else {
@@ -115,8 +116,10 @@ impl Windowed {
 
     /// Begins a window with the present pair where the odometer stands.
     fn begin(&mut self, bench: &mut Workbench, odometer: &Odometer) {
-        let (odom_from_now, cov) = odometer.last_place();
-        self.window.begin_at(&odom_from_now, &cov);
+        let place = odometer.last_place();
+        self.window
+            .begin_at(&place.odom_from_camera, &place.cov, &place.by_sources);
+        self.window.expose(&bench.exposure);
         self.gallery.clear();
         let images = self.images.drain(..).map(|(_, image)| image);
         self.spare_images.extend(images);
@@ -308,15 +311,18 @@ impl Windowed {
             px: portrait.px,
             size_px: portrait.size_px,
         };
-        refinement::refine(
+        let y = &landmark.inverse_depth;
+        let late = bench.exposure.displacement(&bench.rig, &now_from_anchor, y);
+        let found = refinement::refine(
             &bench.rig,
             &appearance,
-            &landmark.inverse_depth,
+            y,
             &now_from_anchor,
             &bench.now.pair.pyramids(),
-            start,
+            &(start + late),
             reach_px,
-        )
+        );
+        found.map(|m| earlier(&m, &late))
     }
 
     /// Whether the window should keep the present pair.
@@ -400,7 +406,12 @@ impl Windowed {
     /// Makes one stereo match a new landmark, if its patch is found on the right.
     fn meet_one(&mut self, bench: &Workbench, i: usize) -> bool {
         let pair = &bench.now.pair;
-        let (coarse, m) = (&bench.now.measurements[i], bench.now.matches[i]);
+        let m = bench.now.matches[i];
+        let late = bench.now.inverse_depths[i].map_or_else(Vector4::zeros, |y| {
+            let exposure = &bench.exposure;
+            exposure.displacement(&bench.rig, &Isometry3::identity(), &y)
+        });
+        let coarse = &earlier(&bench.now.measurements[i], &-late);
         let size_px = f64::from(pair.left.features.keypoints[m.left as usize].size_px);
         let portrait = Portrait {
             id: self.next_id,
@@ -419,7 +430,7 @@ impl Windowed {
         let right = &pair.right.pyramid;
         let found =
             refinement::refine_right(&bench.rig, &appearance, right, coarse, RIGHT_REACH_PX);
-        let Some(measurement) = found else {
+        let Some(measurement) = found.map(|m| earlier(&m, &late)) else {
             return false;
         };
         self.next_id += 1;
@@ -442,6 +453,15 @@ impl Windowed {
             Some(at) => self.images.remove(at).1,
             None => self.spare_images.pop().unwrap_or_default(),
         }
+    }
+}
+
+/// A measurement as it would have been without the displacement `late`, px, that the skew of the
+/// exposures gives it.
+fn earlier(measurement: &StereoMeasurement, late: &Vector4<f64>) -> StereoMeasurement {
+    StereoMeasurement {
+        px: measurement.px - late,
+        ..*measurement
     }
 }
 

@@ -77,39 +77,6 @@ pub fn of_interval(twist: &Vector6<f64>, dt_s: f64, sigma_s: f64) -> Matrix6<f64
     twist * twist.transpose() * (2.0 * sigma_s * sigma_s / (dt_s * dt_s))
 }
 
-/// A covariance by source; the parts are independent of each other and sum to the whole.
-#[derive(Clone, Copy, Debug, Default, PartialEq)]
-pub struct Budget {
-    /// From the noise of measured pixels.
-    pub measurement: Matrix6<f64>,
-    /// From the rig's calibration.
-    pub calibration: Matrix6<f64>,
-    /// From the time between the left and the right exposure, and from time stamps.
-    pub synchronisation: Matrix6<f64>,
-    /// From motions that had to be bridged because they could not be measured.
-    pub bridging: Matrix6<f64>,
-}
-
-impl Budget {
-    /// The parts with their names, in the order of the fields.
-    #[must_use]
-    pub fn parts(&self) -> [(&'static str, &Matrix6<f64>); 4] {
-        [
-            ("measurement", &self.measurement),
-            ("calibration", &self.calibration),
-            ("synchronisation", &self.synchronisation),
-            ("bridging", &self.bridging),
-        ]
-    }
-
-    /// The whole.
-    #[must_use]
-    pub fn total(&self) -> Matrix6<f64> {
-        let sum = self.parts().iter().map(|(_, part)| *part).sum();
-        se3::symmetric(&sum)
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -157,17 +124,6 @@ mod tests {
         }
         let cov = pose.covariance(&SMatrix::<f64, 1, 1>::new(4.0));
         assert!((cov[(2, 2)].sqrt() - 1.0).abs() < 1e-12);
-    }
-
-    #[test]
-    fn the_whole_is_the_sum_of_its_parts() {
-        let budget = Budget {
-            measurement: Matrix6::identity(),
-            calibration: Matrix6::identity() * 2.0,
-            synchronisation: Matrix6::identity() * 3.0,
-            bridging: Matrix6::identity() * 4.0,
-        };
-        assert_eq!(budget.total(), Matrix6::identity() * 10.0);
     }
 
     #[test]

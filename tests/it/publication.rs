@@ -115,6 +115,8 @@ pub(crate) fn odometry(sequence: u64) -> Odometry {
         cov_twist: spread * 3.0,
         budget: ErrorBudget {
             detection: spread,
+            calibration: spread * 0.1,
+            synchronisation: spread * 1e-3,
             bridging: spread * s,
         },
         counts: Counts {
@@ -125,6 +127,7 @@ pub(crate) fn odometry(sequence: u64) -> Odometry {
             inliers: 260,
         },
         variance_factor: 1.0 + 1.0 / (3.0 + s),
+        innovation_ratio: 0.25 + 1.0 / (7.0 + s),
     }
 }
 

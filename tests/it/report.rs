@@ -25,6 +25,9 @@ fn write_odometry(path: &Path, count: u64) {
             variance_factor: f64::NAN,
             latency_ms: None,
             epoch: 0,
+            innovation_ratio: f64::NAN,
+            budget_sigmas: [0.0; 24],
+            is_first_order: true,
         };
         writer.write_row(&row).unwrap();
     }

@@ -41,6 +41,7 @@ BUDGET_PARTS = ("detection", "calibration", "synchronisation", "bridging")
 STAGES = ("capture", "features", "matching", "estimation", "total")
 
 _FLAG_REPLAY = 1
+_FLAG_BEYOND_FIRST_ORDER = 4
 
 Matrix = Tuple[Tuple[float, ...], ...]
 
@@ -92,7 +93,7 @@ class OdometryMessage(ctypes.Structure):
         ("latency_matching_ns", ctypes.c_uint64),
         ("latency_estimation_ns", ctypes.c_uint64),
         ("latency_total_ns", ctypes.c_uint64),
-        ("reserved_2", ctypes.c_uint64),
+        ("innovation_ratio", ctypes.c_double),
     ]
 
     @staticmethod
@@ -180,6 +181,8 @@ class Odometry:
     tracks: int
     inliers: int
     variance_factor: float
+    innovation_ratio: float
+    first_order: bool
     latencies_ns: dict[str, Optional[int]]
 
     @property
@@ -232,6 +235,8 @@ class Odometry:
             tracks=m.tracks,
             inliers=m.inliers,
             variance_factor=m.variance_factor,
+            innovation_ratio=m.innovation_ratio,
+            first_order=not m.flags & _FLAG_BEYOND_FIRST_ORDER,
             latencies_ns={
                 stage: getattr(m, f"latency_{stage}_ns") or None for stage in STAGES
             },

@@ -5,10 +5,11 @@
 //! to come. So the past is corrected by what the window learns, and the pose's covariance has every
 //! correlation in it.
 
+use super::super::sources::BySources;
 use super::warp::WARP;
 use super::{Frame, Joint, row_of};
 use crate::geometry::se3;
-use nalgebra::{DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, Vector6};
 
 /// A pose with an error that is partly the window's.
 #[derive(Clone, Debug)]
@@ -20,15 +21,22 @@ pub(super) struct Datum {
     offset: Vector6<f64>,
     /// Covariance of `ε`.
     cov: Matrix6<f64>,
+    /// By how much `β` moves with each source of error.
+    by_sources: BySources,
 }
 
 impl Datum {
-    pub(super) fn new(odom_from_datum: &Isometry3<f64>, cov: &Matrix6<f64>) -> Self {
+    pub(super) fn new(
+        odom_from_datum: &Isometry3<f64>,
+        cov: &Matrix6<f64>,
+        by_sources: &BySources,
+    ) -> Self {
         Self {
             odom_from_linearised: *odom_from_datum,
             by_window: Matrix6xX::zeros(WARP),
             offset: Vector6::zeros(),
             cov: *cov,
+            by_sources: *by_sources,
         }
     }
 
@@ -47,7 +55,27 @@ impl Datum {
         datum_from_last: &Isometry3<f64>,
         cov_window: &Joint,
     ) -> Matrix6<f64> {
-        let n = cov_window.nrows();
+        let by_window = self.last_by_window(datum_from_last, cov_window.nrows());
+        let carry = se3::adjoint(&datum_from_last.inverse());
+        &by_window * cov_window * by_window.transpose() + carry * self.cov * carry.transpose()
+    }
+
+    /// The derivative of the same pose by each source of error, given that of the warp and all
+    /// poses but the datum's.
+    pub(super) fn sensitivity_of(
+        &self,
+        datum_from_last: &Isometry3<f64>,
+        window_by_sources: &DMatrix<f64>,
+    ) -> BySources {
+        let by_window = self.last_by_window(datum_from_last, window_by_sources.nrows());
+        let carry = se3::adjoint(&datum_from_last.inverse());
+        let mut by_sources = carry * self.by_sources;
+        by_sources += by_window * window_by_sources;
+        by_sources
+    }
+
+    /// The derivative of the pose of the last frame by the window, which has `n` unknowns.
+    fn last_by_window(&self, datum_from_last: &Isometry3<f64>, n: usize) -> Matrix6xX<f64> {
         let carry = se3::adjoint(&datum_from_last.inverse());
         let mut by_window = Matrix6xX::zeros(n);
         let known = self.by_window.ncols().min(n);
@@ -58,7 +86,7 @@ impl Datum {
             let mut own = by_window.columns_mut(n - 6, 6);
             own += Matrix6::<f64>::identity();
         }
-        &by_window * cov_window * by_window.transpose() + carry * self.cov * carry.transpose()
+        by_window
     }
 
     /// Moves the datum on to frame 1, whose error `x₁` is given by the others' as
@@ -69,6 +97,7 @@ impl Datum {
         frames: &[Frame],
         moved: &[Matrix6<f64>],
         mean: &Vector6<f64>,
+        mean_by_sources: &BySources,
         by_rest: &Matrix6xX<f64>,
         cov_first: &Matrix6<f64>,
     ) {
@@ -99,6 +128,7 @@ impl Datum {
         by_window += by_first * by_rest;
         self.odom_from_linearised = se3::renormalised(self.odom_from_linearised * linearised);
         self.offset = by_first * mean + carry * self.offset;
+        self.by_sources = by_first * mean_by_sources + carry * self.by_sources;
         self.cov = se3::symmetric(
             &(by_first * cov_first * by_first.transpose() + carry * self.cov * carry.transpose()),
         );

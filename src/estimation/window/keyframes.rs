@@ -1,5 +1,6 @@
 //! Keyframes: which frames stay in the window, and how the oldest leaves it.
 
+use super::super::sources::{BySources, SOURCES};
 use super::system::At;
 use super::{Landmark, Seen, Window, row_of};
 use crate::geometry::se3;
@@ -107,7 +108,13 @@ impl Window {
         };
         system.build(&at, leaving);
         let (mut hessian, mut gradient) = system.assemble();
+        let mut by_sources =
+            self.sensitivity
+                .right_side(&at, &self.errors, &system, &self.landmarks);
         self.system = system;
+        if let Some(ground) = &self.ground {
+            ground.add_to(&self.frames[..2], &mut hessian, &mut gradient);
+        }
         // From "at the current poses" to "counted from where they are linearised".
         let offsets = self.prior.offsets(&self.warp, &self.frames);
         gradient += &hessian * offsets;
@@ -116,12 +123,19 @@ impl Window {
         top += &self.prior.information;
         let mut head = gradient.rows_mut(0, m);
         head += &self.prior.vector;
-        self.move_datum(&hessian, &gradient);
+        let mut head = by_sources.rows_mut(0, m);
+        head += &self.prior.by_sources;
+        self.move_datum(&hessian, &gradient, &by_sources);
         self.restart_landmarks(oldest, newest);
     }
 
     /// Expresses everything relative to frame 1 and eliminates its pose.
-    fn move_datum(&mut self, hessian: &DMatrix<f64>, gradient: &DVector<f64>) {
+    fn move_datum(
+        &mut self,
+        hessian: &DMatrix<f64>,
+        gradient: &DVector<f64>,
+        by_sources: &DMatrix<f64>,
+    ) {
         let first_linearised = *self.frames[1].datum_from_linearised();
         let all = row_of(self.frames.len());
         let rest = all - 6;
@@ -144,6 +158,11 @@ impl Window {
         // uncertainty then has to grow beyond bounds, which the ridge expresses.
         let cov_first = invert_or_ridge(&se3::symmetric(&first));
         let mean = cov_first * first_gradient;
+        let first_by_sources: BySources = along
+            .tr_mul(by_sources)
+            .fixed_view::<6, SOURCES>(0, 0)
+            .into_owned();
+        let mean_by_sources: BySources = cov_first * first_by_sources;
         let cross = by_first.remove_fixed_rows::<6>(row_of(1));
         let by_rest: Matrix6xX<f64> = -(cov_first * cross.transpose());
         let hessian = hessian
@@ -157,8 +176,18 @@ impl Window {
         self.prior.information = symmetric.view((0, 0), (known, known)).into_owned();
         let gradient = gradient.clone().remove_fixed_rows::<6>(row_of(1)) - &cross * mean;
         self.prior.vector = gradient.rows(0, known).into_owned();
-        self.datum
-            .advance(&self.frames, &moved, &mean, &by_rest, &cov_first);
+        let of_rest = by_sources.clone().remove_fixed_rows::<6>(row_of(1));
+        let of_first: DMatrix<f64> =
+            &cross * DMatrix::from_column_slice(6, SOURCES, mean_by_sources.as_slice());
+        self.prior.by_sources = (of_rest - of_first).rows(0, known).into_owned();
+        self.datum.advance(
+            &self.frames,
+            &moved,
+            &mean,
+            &mean_by_sources,
+            &by_rest,
+            &cov_first,
+        );
         let first = self.frames[1].datum_from_frame;
         self.frames.remove(0);
         let last = self.frames.len() - 1;

@@ -20,7 +20,9 @@
 mod datum;
 mod keyframes;
 mod landmark;
+mod planar;
 mod prior;
+mod sensitivity;
 mod solve;
 mod system;
 #[cfg(test)]
@@ -31,13 +33,17 @@ pub use landmark::{Landmark, LandmarkId, Observation};
 pub use solve::Consent;
 
 use super::closed_form::MotionEstimate;
+use super::sources::{BySources, Exposure, RigErrors, SOURCES};
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
 use datum::Datum;
 use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4};
+use planar::Ground;
 use prior::Prior;
+use sensitivity::Sensitivity;
 use system::System;
-use warp::{WARP, Warp};
+pub(super) use warp::WARP;
+use warp::Warp;
 
 /// Where the unknowns of frame `i` begin, i > 0.
 const fn row_of(i: usize) -> usize {
@@ -58,6 +64,8 @@ struct Frame {
     is_keyframe: bool,
     /// Landmarks seen when it became a keyframe.
     landmarks: usize,
+    /// How its two images were taken.
+    exposure: Exposure,
 }
 
 impl Frame {
@@ -73,6 +81,10 @@ pub struct Window {
     rig: StereoRig,
     warp: Warp,
     cov_warp: SMatrix<f64, WARP, WARP>,
+    warp_by_sources: SMatrix<f64, WARP, SOURCES>,
+    errors: RigErrors,
+    ground: Option<Ground>,
+    sensitivity: Sensitivity,
     settings: Settings,
     datum: Datum,
     prior: Prior,
@@ -111,13 +123,25 @@ impl Window {
     pub fn new(rig: StereoRig, settings: Settings) -> Self {
         let warp = Warp::new(&rig);
         let cov_warp = warp::prior_covariance(&rig, &settings);
+        let prior = Prior::new(&warp, &cov_warp);
+        let warp_by_sources = (cov_warp * &prior.by_sources)
+            .fixed_view::<WARP, SOURCES>(0, 0)
+            .into_owned();
         Self {
-            prior: Prior::new(&warp, &cov_warp),
+            prior,
+            errors: RigErrors::of(&rig, &settings),
+            ground: Ground::of(&rig, &settings),
+            sensitivity: Sensitivity::default(),
             rig,
             warp,
             cov_warp,
+            warp_by_sources,
             settings,
-            datum: Datum::new(&Isometry3::identity(), &Matrix6::zeros()),
+            datum: Datum::new(
+                &Isometry3::identity(),
+                &Matrix6::zeros(),
+                &BySources::zeros(),
+            ),
             frames: Vec::with_capacity(MAX_FRAMES),
             landmarks: Vec::new(),
             next_serial: 0,
@@ -247,14 +271,21 @@ type Joint = DMatrix<f64>;
 pub struct Tracked {
     /// Pose of the frame in the odometry frame.
     pub odom_from_now: Isometry3<f64>,
-    /// Its covariance, right perturbation.
+    /// Its covariance, right perturbation: of the pixels' noise and of the warp's prior.
     pub cov_pose_right: Matrix6<f64>,
-    /// The motion since the frame before.
+    /// What each source of error does to it.
+    pub pose_by_sources: BySources,
+    /// The motion since the frame before, its covariance as the pose's.
     pub motion: MotionEstimate,
+    /// What each source of error does to it.
+    pub motion_by_sources: BySources,
     /// A-posteriori variance factor of this frame's measurements.
     pub variance_factor: f64,
     /// Measurements of this frame that the estimate rests on.
     pub inliers: u32,
+    /// How far the frame leaves flat ground, where that is the model: χ² with three degrees of
+    /// freedom on ground that is flat.
+    pub departure: Option<f64>,
 }
 
 /// A landmark seen in the newest frame.

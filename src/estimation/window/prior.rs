@@ -4,6 +4,7 @@
 //! the poses of frames 1 … m (relative to the datum, frame 0), together `x`, each counted from
 //! where the prior was linearised: cost `½ xᵀ H x − bᵀ x`.
 
+use super::super::sources::{SOURCES, WARP_COLUMNS};
 use super::warp::{WARP, Warp};
 use super::{Frame, row_of};
 use crate::geometry::se3;
@@ -14,6 +15,8 @@ use nalgebra::{DMatrix, DVector, Isometry3, SMatrix};
 pub(super) struct Prior {
     pub(super) information: DMatrix<f64>,
     pub(super) vector: DVector<f64>,
+    /// By how much the vector moves with each source of error.
+    pub(super) by_sources: DMatrix<f64>,
 }
 
 impl Prior {
@@ -25,9 +28,29 @@ impl Prior {
         let mut prior = Self {
             information: DMatrix::zeros(WARP, WARP),
             vector: DVector::zeros(WARP),
+            by_sources: DMatrix::zeros(WARP, SOURCES),
         };
         prior.information.copy_from(&information);
         prior.vector.copy_from(&(information * warp.coefficients));
+        if let Some(factor) = cov.cholesky() {
+            let by_own = information * factor.l();
+            prior
+                .by_sources
+                .view_mut((0, WARP_COLUMNS), (WARP, WARP))
+                .copy_from(&by_own);
+        }
+        prior
+    }
+
+    /// The same, the warp's error being known by source.
+    pub(super) fn learnt(
+        warp: &Warp,
+        cov: &SMatrix<f64, WARP, WARP>,
+        warp_by_sources: &SMatrix<f64, WARP, SOURCES>,
+    ) -> Self {
+        let mut prior = Self::new(warp, cov);
+        let by_sources = &prior.information * warp_by_sources;
+        prior.by_sources.copy_from(&by_sources);
         prior
     }
 

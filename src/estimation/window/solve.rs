@@ -3,6 +3,7 @@
 use super::super::closed_form::MotionEstimate;
 use super::super::consensus::{self, Search, Sighting};
 use super::super::sight;
+use super::super::sources::{BySources, Exposure, SOURCES};
 use super::datum::Datum;
 use super::prior::Prior;
 use super::system::{At, System};
@@ -42,12 +43,18 @@ const LARGEST_OVER_MEDIAN: f64 = 5.0;
 const ROUNDS: usize = 3;
 
 impl Window {
-    /// Begins, or begins anew, with a frame that stands at `odom_from_first`, known to `cov_right`:
-    /// a keyframe without landmarks as yet. What was learnt of the rig is kept.
-    pub fn begin_at(&mut self, odom_from_first: &Isometry3<f64>, cov_right: &Matrix6<f64>) {
+    /// Begins, or begins anew, with a frame that stands at `odom_from_first`, known to `cov_right`,
+    /// `by_sources` of which is due to the sources of error: a keyframe without landmarks as yet. What
+    /// was learnt of the rig is kept.
+    pub fn begin_at(
+        &mut self,
+        odom_from_first: &Isometry3<f64>,
+        cov_right: &Matrix6<f64>,
+        by_sources: &BySources,
+    ) {
         let serial = self.take_serial();
-        self.datum = Datum::new(odom_from_first, cov_right);
-        self.prior = Prior::new(&self.warp, &self.cov_warp);
+        self.datum = Datum::new(odom_from_first, cov_right, by_sources);
+        self.prior = Prior::learnt(&self.warp, &self.cov_warp, &self.warp_by_sources);
         self.frames.clear();
         self.landmarks.clear();
         self.frames.push(Frame {
@@ -56,6 +63,7 @@ impl Window {
             linearised: None,
             is_keyframe: true,
             landmarks: 0,
+            exposure: Exposure::default(),
         });
     }
 
@@ -117,11 +125,19 @@ impl Window {
             linearised: None,
             is_keyframe: false,
             landmarks: 0,
+            exposure: Exposure::default(),
         });
         for s in seen {
             if let Ok(at) = self.landmarks.binary_search_by_key(&s.id, |l| l.id) {
                 self.landmarks[at].observe(serial, s.measurement);
             }
+        }
+    }
+
+    /// Says how the newest frame's images were taken; at the same instant otherwise.
+    pub fn expose(&mut self, exposure: &Exposure) {
+        if let Some(newest) = self.frames.last_mut() {
+            newest.exposure = *exposure;
         }
     }
 
@@ -175,10 +191,13 @@ impl Window {
         if inliers < self.settings.min_inliers {
             return None;
         }
+        // With the weights that the joint covariance has.
+        let by_sources = self.by_sources(&joint);
         let variance_factor = self.measure_variance()?;
         self.variance.take(variance_factor);
         self.cov_warp = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
-        Some(self.tracked(&joint, variance_factor, inliers))
+        self.warp_by_sources = by_sources.fixed_view::<WARP, SOURCES>(0, 0).into_owned();
+        Some(self.tracked(&joint, &by_sources, variance_factor, inliers))
     }
 
     /// Levenberg–Marquardt over warp, poses and landmarks; the joint covariance of warp and poses at
@@ -223,6 +242,24 @@ impl Window {
         joint
     }
 
+    /// The derivative of warp and poses by each source of error.
+    fn by_sources(&mut self, joint: &Joint) -> DMatrix<f64> {
+        let at = At {
+            rig: &self.rig,
+            warp: &self.warp,
+            frames: &self.frames,
+            without: None,
+            variance_factor: self.variance.smoothed,
+            damping: 0.0,
+        };
+        let mut right =
+            self.sensitivity
+                .right_side(&at, &self.errors, &self.system, &self.landmarks);
+        let mut head = right.rows_mut(0, self.prior.vector.len());
+        head += &self.prior.by_sources;
+        joint * right
+    }
+
     /// The equations at the present state, the prior included, and the cost.
     fn equations(&self, system: &mut System, damping: f64) -> (DMatrix<f64>, DVector<f64>, f64) {
         let at = At {
@@ -238,7 +275,10 @@ impl Window {
         let of_prior = self
             .prior
             .add_to(&self.warp, &self.frames, &mut hessian, &mut gradient);
-        (hessian, gradient, cost + of_prior)
+        let of_ground = self.ground.as_ref().map_or(0.0, |ground| {
+            ground.add_to(&self.frames, &mut hessian, &mut gradient)
+        });
+        (hessian, gradient, cost + of_prior + of_ground)
     }
 
     fn state(&self, cost: f64) -> State {
@@ -353,7 +393,13 @@ impl Window {
         Some(sum / freedom)
     }
 
-    fn tracked(&self, joint: &Joint, variance_factor: f64, inliers: u32) -> Tracked {
+    fn tracked(
+        &self,
+        joint: &Joint,
+        by_sources: &DMatrix<f64>,
+        variance_factor: f64,
+        inliers: u32,
+    ) -> Tracked {
         let n = self.frames.len();
         let newest = self.frames[n - 1].datum_from_frame;
         let before = self.frames[n - 2].datum_from_frame;
@@ -372,12 +418,20 @@ impl Window {
         Tracked {
             odom_from_now: self.odom_from_newest(),
             cov_pose_right: self.pose_covariance(&newest, joint),
+            pose_by_sources: self.datum.sensitivity_of(&newest, by_sources),
+            motion_by_sources: (&by_window * by_sources)
+                .fixed_view::<6, SOURCES>(0, 0)
+                .into_owned(),
             motion: MotionEstimate {
                 prev_from_now,
                 cov_right: se3::symmetric(&cov),
             },
             variance_factor,
             inliers,
+            departure: self
+                .ground
+                .as_ref()
+                .and_then(|ground| ground.departure_of_last(&self.frames, joint)),
         }
     }
 }

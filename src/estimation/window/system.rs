@@ -58,19 +58,19 @@ struct Sightline {
 
 /// A landmark, eliminated.
 #[derive(Clone, Debug)]
-struct Reduced {
-    landmark: usize,
+pub(super) struct Reduced {
+    pub(super) landmark: usize,
     crosses: std::ops::Range<usize>,
-    cov: Matrix3<f64>,
+    pub(super) cov: Matrix3<f64>,
     gradient: Vector3<f64>,
-    by_warp: SMatrix<f64, WARP, 3>,
+    pub(super) by_warp: SMatrix<f64, WARP, 3>,
 }
 
 /// What joins a landmark to a frame's pose.
 #[derive(Clone, Debug)]
-struct Cross {
-    frame: usize,
-    by_point: SMatrix<f64, 6, 3>,
+pub(super) struct Cross {
+    pub(super) frame: usize,
+    pub(super) by_point: SMatrix<f64, 6, 3>,
 }
 
 impl System {
@@ -87,6 +87,31 @@ impl System {
         }
         self.expand_sightlines();
         cost / at.variance_factor
+    }
+
+    /// The landmarks that were eliminated.
+    pub(super) fn reduced(&self) -> &[Reduced] {
+        &self.reduced
+    }
+
+    /// What joins an eliminated landmark to poses.
+    pub(super) fn crosses_of(&self, reduced: &Reduced) -> &[Cross] {
+        &self.crosses[reduced.crosses.clone()]
+    }
+
+    /// Maps a point of an anchor into a frame; and the same where Jacobians were taken, if elsewhere.
+    pub(super) fn sightline(
+        &self,
+        anchor: usize,
+        frame: usize,
+    ) -> (&Isometry3<f64>, Option<&Isometry3<f64>>) {
+        let line = &self.sightlines[anchor * self.frame_count + frame];
+        (&line.frame_from_anchor, line.linearised.as_ref())
+    }
+
+    /// The adjoint of that.
+    pub(super) fn adjoint(&self, anchor: usize, frame: usize) -> &Matrix6<f64> {
+        &self.sightlines[anchor * self.frame_count + frame].adjoint
     }
 
     fn begin(&mut self, frames: &[Frame]) {
@@ -305,7 +330,7 @@ impl System {
 
 /// Robust information, the residual, and the loss (σ²) of one frame's measurement. Huber's bend
 /// stands at so many σ as residuals really have.
-fn weigh(
+pub(super) fn weigh(
     residual: &Vector4<f64>,
     sigma_px: &Vector4<f64>,
     variance_factor: f64,

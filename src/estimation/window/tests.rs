@@ -53,7 +53,7 @@ fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, se
         consistency::nees(error, cov).expect("positive definite")
     };
     simulation.observe(&truth, &mut frame);
-    window.begin_at(&truth, &(Matrix6::identity() * 1e-16));
+    window.begin_at(&truth, &(Matrix6::identity() * 1e-16), &BySources::zeros());
     window.promote(&sights(&frame, displaced_px));
     for k in 1..=steps {
         truth *= step();
@@ -167,7 +167,7 @@ fn a_standing_robot_neither_drifts_nor_grows_its_covariance() {
     let mut window = Window::new(rig, exact());
     let still = Isometry3::identity();
     simulation.observe(&still, &mut frame);
-    window.begin_at(&still, &(Matrix6::identity() * 1e-16));
+    window.begin_at(&still, &(Matrix6::identity() * 1e-16), &BySources::zeros());
     window.promote(&sights(&frame, 0.0));
     let mut first_cov = None;
     for k in 1..=60 {
@@ -191,7 +191,11 @@ fn a_standing_robot_neither_drifts_nor_grows_its_covariance() {
 fn what_cannot_be_adjusted_leaves_the_window_as_it_was() {
     let rig = simulation::thesis_rig();
     let mut window = Window::new(rig, exact());
-    window.begin_at(&Isometry3::identity(), &(Matrix6::identity() * 1e-12));
+    window.begin_at(
+        &Isometry3::identity(),
+        &(Matrix6::identity() * 1e-12),
+        &BySources::zeros(),
+    );
     window.promote(&[]);
     let before = window.newest_serial();
     window.add(&step(), &[]);

@@ -16,7 +16,7 @@ use nalgebra::{DVector, Isometry3, SMatrix, SVector, Vector2, Vector4};
 /// Terms across the baseline: 1, x, y, x², xy, y².
 const TERMS: usize = 6;
 /// Unknowns: the displacement along the baseline, then the terms across it.
-pub(super) const WARP: usize = 1 + TERMS;
+pub(in super::super) const WARP: usize = 1 + TERMS;
 
 /// Derivative of the displacement, px, by the unknowns.
 pub(super) type ByWarp = SMatrix<f64, 2, WARP>;

@@ -32,6 +32,9 @@ fn rows(count: u64) -> Vec<OdometryRow> {
                 variance_factor: 1.1,
                 latency_ms: Some(20.0),
                 epoch: 0,
+                innovation_ratio: f64::NAN,
+                budget_sigmas: [0.0; 24],
+                is_first_order: true,
             };
             pose *= step;
             row
