@@ -28,6 +28,8 @@ pub mod montecarlo;
 pub mod output;
 pub mod pipeline;
 pub mod refinement;
+#[cfg(feature = "mcap")]
+pub mod ros;
 pub mod settings;
 mod simd;
 pub mod simulation;
