@@ -29,6 +29,8 @@ pub mod output;
 pub mod pipeline;
 mod queue;
 pub mod refinement;
+#[cfg(feature = "mcap")]
+pub mod ros;
 pub mod settings;
 mod simd;
 pub mod simulation;

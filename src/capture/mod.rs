@@ -29,6 +29,8 @@ pub mod files;
 mod jpeg;
 mod kitti;
 pub mod live;
+#[cfg(feature = "mcap")]
+pub mod mcap;
 mod own;
 pub mod pace;
 pub mod pairing;

@@ -2,15 +2,18 @@
 
 use super::session::{Finished, Session, unwritable};
 use super::{Failure, summary};
-use crate::capture::{Dataset, ReadAhead, Realtime};
+#[cfg(feature = "mcap")]
+use crate::capture::mcap::McapRecording;
+use crate::capture::{Dataset, PairSource, ReadAhead, Realtime};
 use crate::config::Config;
-use crate::geometry::load_rig;
+use crate::geometry::{StereoRig, load_rig};
 use std::path::{Path, PathBuf};
 
 /// Run a recording through the pipeline instead of cameras.
 ///
 /// DATASET is a folder in one of three layouts: visod's own (left/, right/, rig.toml), KITTI
-/// odometry (image_0/, image_1/, calib.txt, times.txt) or EuRoC (mav0/cam0, mav0/cam1). The same
+/// odometry (image_0/, image_1/, calib.txt, times.txt) or EuRoC (mav0/cam0, mav0/cam1); or an MCAP
+/// file with the images of two cameras as messages of ROS 2. The same
 /// recording and configuration give the same output to the last bit, whatever the number of
 /// workers; therefore latencies are in the summary and in the messages, and `nan` in the CSV.
 #[derive(clap::Args)]
@@ -18,7 +21,7 @@ use std::path::{Path, PathBuf};
     after_help = "Example: visod replay recording --odometry odometry.csv --report report.html"
 )]
 pub(crate) struct Args {
-    /// The recording's folder.
+    /// The recording's folder, or an MCAP file.
     dataset: PathBuf,
     /// Settings of the pipeline [default: what `config/visod.toml` shows].
     #[arg(long, value_name = "FILE")]
@@ -32,6 +35,13 @@ pub(crate) struct Args {
     /// Write the trajectory in TUM format.
     #[arg(long, value_name = "F.txt")]
     trajectory: Option<PathBuf>,
+    /// Record images, poses and state as messages of ROS 2, for Foxglove and ROS 2's own tools.
+    #[arg(long, value_name = "F.mcap")]
+    mcap: Option<PathBuf>,
+    /// The topics of an MCAP file that hold the left and the right images, where their names do not
+    /// tell.
+    #[arg(long, num_args = 2, value_names = ["LEFT", "RIGHT"])]
+    topics: Option<Vec<String>>,
     /// Write the run's figures as JSON: counts, latencies, processor time, memory.
     #[arg(long, value_name = "F.json")]
     summary: Option<PathBuf>,
@@ -66,6 +76,12 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         Some(file) => Some(load_rig(file).map_err(Failure::usage)?),
         None => None,
     };
+    if args.dataset.is_file() {
+        return replay_mcap(args, config, rig);
+    }
+    if args.topics.is_some() {
+        return Err(Failure::usage("--topics is for MCAP files"));
+    }
     let dataset =
         Dataset::open_with(&args.dataset, rig, config.dataset.clone()).map_err(Failure::usage)?;
     if dataset.nominal_times {
@@ -74,28 +90,57 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
             args.dataset.display()
         );
     }
-    let mut session = Session::new(config, dataset.rig.clone());
+    let source = ReadAhead::start(&dataset).map_err(Failure::other)?;
+    let truth = dataset.ground_truth.as_deref();
+    replay(args, config, dataset.rig.clone(), source, truth)
+}
+
+/// A file rather than a folder.
+#[cfg(feature = "mcap")]
+fn replay_mcap(args: &Args, config: Config, rig: Option<StereoRig>) -> Result<(), Failure> {
+    let topics = match args.topics.as_deref() {
+        Some([left, right]) => Some([left.as_str(), right.as_str()]),
+        _ => None,
+    };
+    let recording = McapRecording::open(&args.dataset, rig, topics, config.dataset.clone())
+        .map_err(Failure::usage)?;
+    let source = recording.source().map_err(Failure::other)?;
+    replay(args, config, recording.rig, source, None)
+}
+
+#[cfg(not(feature = "mcap"))]
+fn replay_mcap(args: &Args, _: Config, _: Option<StereoRig>) -> Result<(), Failure> {
+    Err(Failure::usage(format!(
+        "{}: is not a folder with a recording, and this visod was built without the feature mcap",
+        args.dataset.display()
+    )))
+}
+
+/// Runs the pairs of a recording through the pipeline.
+fn replay(
+    args: &Args,
+    config: Config,
+    rig: StereoRig,
+    source: impl PairSource,
+    truth: Option<&Path>,
+) -> Result<(), Failure> {
+    let mut session = Session::new(config, rig);
     session.write_csv(args.odometry.as_deref())?;
     session.write_trajectory(args.trajectory.as_deref())?;
+    session.write_mcap(args.mcap.as_deref())?;
     if args.report.is_some() {
         session.keep_rows();
     }
     if !args.no_publish {
         publish(&mut session);
     }
-    let source = ReadAhead::start(&dataset).map_err(Failure::other)?;
     let finished = match args.pace {
         Pace::Max => session.run(source),
         Pace::Realtime => session.run(Realtime::new(source)),
     }?;
     if let Some(file) = &args.report {
         let title = args.dataset.display().to_string();
-        summary::write_report(
-            file,
-            &finished.rows,
-            dataset.ground_truth.as_deref(),
-            &title,
-        )?;
+        summary::write_report(file, &finished.rows, truth, &title)?;
     }
     conclude(args, &finished)
 }

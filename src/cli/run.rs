@@ -23,6 +23,9 @@ pub(crate) struct Args {
     /// Write the trajectory in TUM format.
     #[arg(long, value_name = "F.txt")]
     trajectory: Option<PathBuf>,
+    /// Record images, poses and state as messages of ROS 2, for Foxglove and ROS 2's own tools.
+    #[arg(long, value_name = "F.mcap")]
+    mcap: Option<PathBuf>,
     /// Write the run's figures as JSON.
     #[arg(long, value_name = "F.json")]
     summary: Option<PathBuf>,
@@ -54,6 +57,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let source = setup.open(delivery, &stop)?;
     session.watch(source.monitor());
+    session.write_mcap(args.mcap.as_deref())?;
     stop.end_run(source.monitor(), args.seconds)?;
     let finished = session.run(source)?;
     let json = summary::to_json(&args.config, &finished).map_err(Failure::other)?;

@@ -9,6 +9,8 @@ use crate::config::Config;
 use crate::features;
 use crate::geometry::{Severity, StereoRig, check_rig};
 use crate::output::csv::OdometryCsvWriter;
+#[cfg(feature = "mcap")]
+use crate::output::mcap::McapRecorder;
 #[cfg(feature = "ipc")]
 use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
@@ -29,6 +31,8 @@ pub(crate) struct Session {
     rig: StereoRig,
     csv: Option<(PathBuf, OdometryCsvWriter<File>)>,
     trajectory: Option<(PathBuf, TumWriter<File>)>,
+    #[cfg(feature = "mcap")]
+    mcap: Option<(PathBuf, McapRecorder)>,
     rows: Option<Vec<OdometryRow>>,
     #[cfg(feature = "ipc")]
     publisher: Option<Publisher>,
@@ -77,6 +81,8 @@ impl Session {
             rig,
             csv: None,
             trajectory: None,
+            #[cfg(feature = "mcap")]
+            mcap: None,
             rows: None,
             #[cfg(feature = "ipc")]
             publisher: None,
@@ -111,6 +117,29 @@ impl Session {
             self.trajectory = Some((file.to_owned(), trajectory));
         }
         Ok(())
+    }
+
+    /// Records images and estimates as messages of ROS 2. Where the pairs come from cameras, images
+    /// are left out rather than waited for.
+    #[cfg(feature = "mcap")]
+    pub(crate) fn write_mcap(&mut self, file: Option<&Path>) -> Result<(), Failure> {
+        if let Some(file) = file {
+            let waits = self.live.is_none();
+            let mcap =
+                McapRecorder::create(file, &self.rig, waits).map_err(|e| unwritable(file, &e))?;
+            self.mcap = Some((file.to_owned(), mcap));
+        }
+        Ok(())
+    }
+
+    #[cfg(not(feature = "mcap"))]
+    pub(crate) fn write_mcap(&mut self, file: Option<&Path>) -> Result<(), Failure> {
+        match file {
+            Some(_) => Err(Failure::usage(
+                "--mcap: this visod was built without the feature mcap",
+            )),
+            None => Ok(()),
+        }
     }
 
     /// Keeps all rows for a report.
@@ -178,6 +207,17 @@ impl Session {
         if let Some((file, trajectory)) = self.trajectory {
             trajectory.finish().map_err(|e| unwritable(&file, &e))?;
         }
+        #[cfg(feature = "mcap")]
+        if let Some((file, mcap)) = self.mcap {
+            let left_out = mcap.left_out();
+            mcap.finish().map_err(|e| unwritable(&file, &e))?;
+            if left_out > 0 {
+                eprintln!(
+                    "visod: warning: {}: the images of {left_out} pairs were left out, as the disk was behind",
+                    file.display()
+                );
+            }
+        }
         #[cfg(feature = "ipc")]
         if let Some(publisher) = self.publisher {
             publisher.close();
@@ -230,6 +270,11 @@ impl Session {
         if let Some((file, trajectory)) = &mut self.trajectory {
             trajectory
                 .write(row.timestamp_ns, &delivery.odometry.odom_from_camera)
+                .map_err(|e| named(file, &e))?;
+        }
+        #[cfg(feature = "mcap")]
+        if let Some((file, mcap)) = &mut self.mcap {
+            mcap.add(delivery.odometry, delivery.pair)
                 .map_err(|e| named(file, &e))?;
         }
         if let Some(see) = &mut self.each_row {

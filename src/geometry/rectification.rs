@@ -50,6 +50,18 @@ impl Rectification {
         self.focal_px
     }
 
+    /// Turns directions of the left camera into the common frame.
+    #[must_use]
+    pub fn common_from_left(&self) -> &Rotation3<f64> {
+        &self.common_from_left
+    }
+
+    /// Turns directions of the right camera into the common frame.
+    #[must_use]
+    pub fn common_from_right(&self) -> &Rotation3<f64> {
+        &self.common_from_right
+    }
+
     /// The disparity, px, of a point `depth_m` in front of the rectified plane's origin.
     #[must_use]
     pub fn disparity_px(&self, depth_m: f64) -> f64 {

@@ -6,6 +6,7 @@
 //! | [`mounting`] | odometry of the camera as odometry of the robot's base |
 //! | `publisher`, `subscriber` (feature `ipc`) | those layouts to and from iceoryx2 services |
 //! | [`row`], [`csv`], [`json`] | one odometry estimate as a row or an object, number for number the same text |
+//! | `mcap` (feature `mcap`) | a recording that ROS 2 and Foxglove read |
 //! | [`report`] | one HTML page about a run |
 //! | [`tum`] | the trajectory for other tools |
 
@@ -14,6 +15,8 @@ pub mod health;
 #[cfg(feature = "ipc")]
 mod ipc;
 pub mod json;
+#[cfg(feature = "mcap")]
+pub mod mcap;
 pub mod message;
 pub mod mounting;
 pub mod number;

@@ -71,6 +71,8 @@ pub struct Delivery<'a> {
     pub latencies: StageLatencies,
     /// Why the pair was not usable, where it was not.
     pub unusable: Option<&'a str>,
+    /// The images, where there are both.
+    pub pair: Option<&'a StereoPair>,
 }
 
 /// Why a run ended early.
@@ -315,6 +317,7 @@ fn collect<E>(
                 odometry: &outcome.odometry,
                 latencies: outcome.latencies,
                 unusable: outcome.unusable.as_deref(),
+                pair: outcome.buffers.used.as_ref(),
             };
             if deliver(delivery)
                 .map_err(PipelineError::Deliver)?

@@ -14,6 +14,9 @@ mod frame_source;
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod gige;
 #[cfg(test)]
+#[cfg(feature = "mcap")]
+mod mcap;
+#[cfg(test)]
 mod mistakes;
 #[cfg(test)]
 mod montecarlo;

@@ -1,0 +1,65 @@
+//! An MCAP file in; its records out, front to back, one at a time.
+
+use mcap::records::Record;
+use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
+use std::fs::File;
+use std::io::Read;
+use std::path::Path;
+
+/// Longest record that is read, bytes: an image of the largest size, and the chunk around it.
+const MAX_RECORD_BYTES: usize = 1 << 30;
+
+/// Reads records.
+pub(super) struct Records {
+    file: File,
+    reader: LinearReader,
+}
+
+impl Records {
+    pub(super) fn open(path: &Path) -> Result<Self, String> {
+        let file = File::open(path).map_err(|e| format!("cannot be read: {e}"))?;
+        let options = LinearReaderOptions::default()
+            .with_validate_chunk_crcs(true)
+            .with_record_length_limit(MAX_RECORD_BYTES);
+        Ok(Self {
+            file,
+            reader: LinearReader::new_with_options(options),
+        })
+    }
+
+    /// Hands the next record to `take`; `None` after the last.
+    ///
+    /// # Errors
+    /// One sentence: the file ends early, or is damaged from here on.
+    pub(super) fn next<T>(
+        &mut self,
+        take: impl FnOnce(Record<'_>) -> T,
+    ) -> Result<Option<T>, String> {
+        while let Some(event) = self.reader.next_event() {
+            match event.map_err(|e| sentence(&e))? {
+                LinearReadEvent::ReadRequest(need) => {
+                    let read = self
+                        .file
+                        .read(self.reader.insert(need))
+                        .map_err(|e| format!("cannot be read: {e}"))?;
+                    self.reader.notify_read(read);
+                }
+                LinearReadEvent::Record { opcode, data } => {
+                    let record = mcap::parse_record(opcode, data).map_err(|e| sentence(&e))?;
+                    return Ok(Some(take(record)));
+                }
+            }
+        }
+        Ok(None)
+    }
+}
+
+fn sentence(error: &mcap::McapError) -> String {
+    match error {
+        mcap::McapError::BadMagic => "is no MCAP file, or was cut off".to_owned(),
+        mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc => {
+            "ends in the middle of a record: it was cut off".to_owned()
+        }
+        other => format!("is damaged: {other}"),
+    }
+}
