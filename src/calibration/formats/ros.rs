@@ -60,7 +60,8 @@ fn one(file: &Path) -> Result<(Camera, Isometry3<f64>), String> {
             .to_string());
     }
     let z = p[11];
-    let shift = [(p[3] - p[2] * z) / p[0], (p[7] - p[6] * z) / p[5], z];
+    // The camera sees K′ (q + t′) of a point q in the common frame: R p = q + t′.
+    let shift = [(p[3] - p[2] * z) / p[0], (p[7] - p[6] * z) / p[5], z].map(|t| -t);
     Ok((camera, motion(turn, shift)))
 }
 
