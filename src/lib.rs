@@ -13,9 +13,11 @@
 //!
 //! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
 //! [`pipeline`] (threads), [`config`] and `cli`. Beside them stand [`simulation`], which renders
-//! recordings with known truth, [`montecarlo`], which holds covariances against the errors of many
+//! recordings with known truth, [`calibration`], which finds a rig from views of a board, [`montecarlo`],
+//! which holds covariances against the errors of many
 //! runs, and [`evaluation`], which compares an estimate with the truth.
 
+pub mod calibration;
 pub mod capture;
 pub mod config;
 pub mod estimation;

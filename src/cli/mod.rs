@@ -1,5 +1,9 @@
 //! The command line: one file a command.
 
+mod calibrate;
+#[cfg(feature = "opencv")]
+mod calibrate_live;
+mod calibrate_views;
 mod cameras;
 mod check;
 mod demo;
@@ -15,6 +19,7 @@ mod record;
 mod replay;
 mod report;
 mod rig;
+mod rig_convert;
 mod run;
 mod session;
 mod simulate;
@@ -48,6 +53,7 @@ enum Command {
     Report(report::Args),
     Features(features::Args),
     Montecarlo(Box<montecarlo::Args>),
+    Calibrate(Box<calibrate::Args>),
     Rig(rig::Args),
     Cameras(cameras::Args),
     Check(check::Args),
@@ -88,6 +94,7 @@ pub fn main() -> ExitCode {
         Command::Report(args) => report::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Rig(args) => rig::run(&args),
         Command::Cameras(args) => cameras::run(&args),
         Command::Check(args) => check::run(&args),
