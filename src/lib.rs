@@ -12,7 +12,7 @@
 //! | [`output`] | odometry | shared memory, CSV, report |
 //!
 //! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
-//! [`pipeline`] (threads), [`config`] and `cli`. Beside them stand [`simulation`], which renders
+//! [`pipeline`] (threads), [`service`] (systemd, scheduling), [`config`] and `cli`. Beside them stand [`simulation`], which renders
 //! recordings with known truth, [`montecarlo`], which holds covariances against the errors of many
 //! runs, and [`evaluation`], which compares an estimate with the truth.
 
@@ -28,6 +28,7 @@ pub mod montecarlo;
 pub mod output;
 pub mod pipeline;
 pub mod refinement;
+pub mod service;
 pub mod settings;
 mod simd;
 pub mod simulation;

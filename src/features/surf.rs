@@ -85,6 +85,7 @@ impl Settings {
 #[derive(Debug)]
 pub struct Surf {
     settings: Settings,
+    share: f32,
     compass: Compass,
     integral: IntegralImage,
     detector: Detector,
@@ -102,6 +103,7 @@ impl Surf {
         settings.check()?;
         Ok(Self {
             settings,
+            share: 1.0,
             compass: Compass::new(),
             integral: IntegralImage::default(),
             detector: Detector::default(),
@@ -109,6 +111,18 @@ impl Surf {
             describer: Describer::new(),
             order: Vec::new(),
         })
+    }
+
+    /// Keypoints to be kept of those found, 0 for all: the budget's share.
+    fn budget(&self, found: usize) -> usize {
+        if self.share >= 1.0 {
+            return self.settings.budget;
+        }
+        let all = match self.settings.budget {
+            0 => found,
+            budget => budget.min(found),
+        };
+        ((all as f32 * self.share) as usize).max(1)
     }
 
     /// Gives direction, σ and descriptor to the keypoints; drops those so near to the border that
@@ -179,10 +193,14 @@ impl Extractor for Surf {
         self.detector
             .detect(&self.integral, search, &mut features.keypoints);
         let size = (image.width(), image.height());
-        self.spread
-            .keep(&mut features.keypoints, self.settings.budget, size);
+        let budget = self.budget(features.keypoints.len());
+        self.spread.keep(&mut features.keypoints, budget, size);
         self.describe(image, features);
         Ok(())
+    }
+
+    fn set_share(&mut self, share: f32) {
+        self.share = share;
     }
 }
 
