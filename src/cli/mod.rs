@@ -1,5 +1,6 @@
 //! The command line: one file a command.
 
+mod attendant;
 mod calibrate;
 #[cfg(feature = "opencv")]
 mod calibrate_live;
@@ -78,6 +79,12 @@ impl Failure {
     pub(crate) fn other(cause: impl std::fmt::Display) -> Self {
         Self::Other(cause.to_string())
     }
+}
+
+/// The whole command line, for what is generated from it: manual pages and completions.
+#[must_use]
+pub fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
 }
 
 /// Runs the command line of this process. Exit code: 0 success, 2 bad usage or configuration, 1 any
