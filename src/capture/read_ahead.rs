@@ -8,10 +8,12 @@ use super::dataset::{Dataset, ImageFiles, PairFiles};
 use super::decode::Decoder;
 use super::{PairEvent, PairSource, StereoPair, Unusable};
 use crate::image::GrayImage;
-use crate::queue::{Receiver, bounded};
+use crate::queue::{bounded_both_ways, prepare_thread};
+use crossbeam_channel::{Receiver, Sender, bounded};
 use std::panic::{AssertUnwindSafe, catch_unwind};
 use std::path::{Path, PathBuf};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
+use std::sync::Arc;
+use std::sync::atomic::{AtomicUsize, Ordering};
 use std::thread::JoinHandle;
 
 /// One side's answer to one pair: the image, or a sentence why there is none.
@@ -146,7 +148,7 @@ impl SideReader {
         pick: fn(&ImageFiles) -> Option<&PathBuf>,
         mut decode: impl FnMut(&Path, &mut GrayImage) -> Result<(), String> + Send + 'static,
     ) -> std::io::Result<Self> {
-        let (to_consumer, decoded) = bounded(depth);
+        let (to_consumer, decoded) = bounded_both_ways(depth, || Err(String::new()));
         let pool = Arc::new(Pool::new(size_px));
         let spares = Arc::clone(&pool);
         let mut side = Self {
@@ -159,6 +161,7 @@ impl SideReader {
         let thread = std::thread::Builder::new()
             .name(name.to_owned())
             .spawn(move || {
+                prepare_thread();
                 for file in pairs.iter().filter_map(|pair| pick(&pair.images)) {
                     let mut image = spares.take();
                     let answer = match decode_safely(&mut decode, file, &mut image) {
@@ -186,7 +189,7 @@ impl SideReader {
     fn take(&self) -> Decoded {
         let gone = || "the thread that decodes images has ended".to_owned();
         let decoded = self.decoded.as_ref().ok_or_else(gone)?;
-        decoded.recv().ok_or_else(gone)?
+        decoded.recv().map_err(|_| gone())?
     }
 
     fn give_back(&self, image: GrayImage) {
@@ -198,51 +201,45 @@ impl SideReader {
 #[derive(Debug)]
 struct Pool {
     size_px: (u32, u32),
-    spare: Mutex<Spare>,
+    give: Sender<GrayImage>,
+    spare: Receiver<GrayImage>,
+    /// Images that there are, here or under way.
+    all: AtomicUsize,
 }
 
-#[derive(Debug, Default)]
-struct Spare {
-    images: Vec<GrayImage>,
-    /// Images that there are, here or under way.
-    all: usize,
-}
+/// More images than any consumer holds.
+const MOST_SPARE: usize = 1024;
 
 impl Pool {
     fn new(size_px: (u32, u32)) -> Self {
+        let (give, spare) = bounded(MOST_SPARE);
         Self {
             size_px,
-            spare: Mutex::default(),
+            give,
+            spare,
+            all: AtomicUsize::new(0),
         }
     }
 
     /// Adds images until there are `count` in all.
     fn grow(&self, count: usize) {
-        let mut spare = self.lock();
-        spare.images.reserve(count);
-        while spare.all < count {
-            let (width, height) = self.size_px;
-            spare.images.push(GrayImage::filled(width, height, 0));
-            spare.all += 1;
+        let (width, height) = self.size_px;
+        let has = self.all.fetch_max(count, Ordering::Relaxed);
+        for _ in has..count {
+            let _ = self.give.try_send(GrayImage::filled(width, height, 0));
         }
     }
 
     /// A spare image, or a new one for a consumer that holds more than it said.
     fn take(&self) -> GrayImage {
-        self.lock().images.pop().unwrap_or_default()
+        self.spare.try_recv().unwrap_or_default()
     }
 
     /// Keeps an image unless there are enough without it.
     fn give_back(&self, image: GrayImage) {
-        let mut spare = self.lock();
-        if spare.images.len() < spare.all {
-            spare.images.push(image);
+        if self.spare.len() < self.all.load(Ordering::Relaxed) {
+            let _ = self.give.try_send(image);
         }
-    }
-
-    fn lock(&self) -> MutexGuard<'_, Spare> {
-        // Nothing panics while it holds the lock.
-        self.spare.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -332,7 +329,7 @@ mod tests {
         let held: Vec<_> = (0..6).map(|_| side.take()).collect();
         let is_of_the_pool = |answer: &Decoded| answer.as_ref().is_ok_and(|i| i.width() == 64);
         assert!(held.iter().all(is_of_the_pool));
-        assert_eq!(side.pool.lock().images.len(), 0);
+        assert_eq!(side.pool.spare.len(), 0);
     }
 
     #[test]
@@ -342,7 +339,7 @@ mod tests {
             assert_eq!(side.take(), Err("unreadable".to_owned()));
         }
         assert!(side.take().is_err(), "after the end");
-        assert_eq!(side.pool.lock().images.len(), 4);
+        assert_eq!(side.pool.spare.len(), 4);
     }
 
     #[test]

@@ -3,7 +3,7 @@
 use super::Failure;
 use super::calibrate::Args;
 use super::calibrate_views::Views;
-use super::live::{Stop, failure, log_to_stderr};
+use super::live::{Stop, failure};
 use crate::calibration::detect::detect_pair;
 use crate::calibration::guidance::{Guide, Verdict};
 use crate::calibration::{Board, Lens};
@@ -11,12 +11,13 @@ use crate::capture::live::{Delivery, LiveSource, Overflow};
 use crate::capture::{PairEvent, PairSource, Side, StereoPair, drivers};
 use crate::config::Config;
 use crate::geometry::{Camera, Distortion, StereoRig};
+use crate::service::log;
 use nalgebra::{Isometry3, Vector2};
 use std::path::Path;
 
 /// Takes views until there are enough, `--views` are reached, or somebody stops it (Ctrl-C).
 pub(super) fn views(args: &Args, file: &Path, board: &Board, lens: Lens) -> Result<Views, Failure> {
-    log_to_stderr();
+    log::start();
     let size_px = args.size.ok_or_else(|| {
         Failure::usage("--size: is missing: it says which images the cameras shall send")
     })?;

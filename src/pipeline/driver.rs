@@ -14,8 +14,9 @@ use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
 use crate::image::GrayImage;
-use crate::queue::{Receiver, Sender, bounded};
+use crate::queue::{bounded, prepare_thread};
 use crate::settings::SettingError;
+use crossbeam_channel::{Receiver, Sender};
 use serde::{Deserialize, Serialize};
 use std::collections::VecDeque;
 use std::ops::ControlFlow;
@@ -105,6 +106,7 @@ pub fn run<S: PairSource, E>(
     method: &mut Method,
     mut deliver: impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), PipelineError<E>> {
+    prepare_thread();
     let under_way = extractors.len() + SLACK_PAIRS;
     source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
@@ -179,7 +181,8 @@ fn feed<S: PairSource>(
     done: &Sender<Done>,
 ) {
     let mut ticket = 0;
-    while let Some(mut buffers) = spare.recv() {
+    prepare_thread();
+    while let Ok(mut buffers) = spare.recv() {
         if let Some(pair) = buffers.used.take() {
             source.recycle(pair);
         }
@@ -232,7 +235,8 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
         }
     }
     let _alarm = Alarm(done);
-    while let Some(mut job) = jobs.recv() {
+    prepare_thread();
+    while let Ok(mut job) = jobs.recv() {
         let started = Instant::now();
         let result = extractor.extract(&job.image, &mut job.described.features);
         job.described.pyramid.fill(&job.image);
@@ -280,7 +284,7 @@ fn collect<E>(
         }
         at
     };
-    while let Some(message) = done.recv() {
+    while let Ok(message) = done.recv() {
         match message {
             Done::WorkerDied => return Err(PipelineError::Worker),
             Done::Unusable {
