@@ -5,6 +5,8 @@
 #[cfg(test)]
 mod accuracy;
 #[cfg(test)]
+mod calibrate;
+#[cfg(test)]
 mod evaluate;
 #[cfg(test)]
 mod features;
