@@ -244,7 +244,10 @@ impl Session {
         self.warned_of_first_order = true;
         let sequence = delivery.odometry.sequence;
         if self.live.is_some() {
-            tracing::warn!(sequence, "rotation too uncertain for a covariance of the pose");
+            tracing::warn!(
+                sequence,
+                "rotation too uncertain for a covariance of the pose"
+            );
         } else {
             bar.suspend(|| {
                 eprintln!(
