@@ -12,10 +12,12 @@
 //! | [`output`] | odometry | shared memory, CSV, report |
 //!
 //! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
-//! [`pipeline`] (threads), [`config`] and `cli`. Beside them stand [`simulation`], which renders
-//! recordings with known truth, [`montecarlo`], which holds covariances against the errors of many
+//! [`pipeline`] (threads), [`service`] (systemd, scheduling), [`config`] and `cli`. Beside them stand
+//! [`simulation`], which renders recordings with known truth, [`calibration`], which finds a rig from
+//! views of a board, [`montecarlo`], which holds covariances against the errors of many
 //! runs, and [`evaluation`], which compares an estimate with the truth.
 
+pub mod calibration;
 pub mod capture;
 pub mod config;
 pub mod estimation;
@@ -31,6 +33,7 @@ mod queue;
 pub mod refinement;
 #[cfg(feature = "mcap")]
 pub mod ros;
+pub mod service;
 pub mod settings;
 mod simd;
 pub mod simulation;

@@ -64,6 +64,19 @@ pub struct Mapped {
     pub event: Option<ClockEvent>,
 }
 
+/// How a camera's clock stands to the host's, as it is known at the last frame.
+#[derive(Clone, Copy, Debug, PartialEq, serde::Serialize)]
+pub struct ClockEstimate {
+    /// The host's CLOCK_MONOTONIC less the camera's clock, and the least delay, ns.
+    pub offset_ns: i64,
+    /// 1 σ of it, ns, the least delay apart.
+    pub sigma_offset_ns: f64,
+    /// How much faster the host's clock runs, millionths.
+    pub drift_ppm: f64,
+    /// 1 σ of it, millionths.
+    pub sigma_drift_ppm: f64,
+}
+
 /// Follows one camera's clock.
 #[derive(Clone, Debug, Default)]
 pub struct ClockMap {
@@ -131,6 +144,19 @@ impl ClockMap {
     #[must_use]
     pub fn fit(&self) -> Option<&Fit> {
         self.fit.as_ref()
+    }
+
+    /// What is known at the last frame.
+    #[must_use]
+    pub fn estimate(&self) -> Option<ClockEstimate> {
+        let (fit, last) = (self.fit.as_ref()?, self.samples.back()?);
+        let (host_ns, sigma_offset_ns) = fit.at(last.camera_ns);
+        Some(ClockEstimate {
+            offset_ns: host_ns - (last.camera_ns - self.unwrapped_ns),
+            sigma_offset_ns,
+            drift_ppm: fit.drift * 1e6,
+            sigma_drift_ppm: fit.sigma_drift * 1e6,
+        })
     }
 
     /// Takes note of a frame and says when it was taken.

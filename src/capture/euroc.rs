@@ -27,7 +27,7 @@ pub(super) fn open(
     }
     let rig = match rig_override {
         Some(rig) => rig,
-        None => rig(&left, &right)?,
+        None => rig(&left.join("sensor.yaml"), &right.join("sensor.yaml"))?,
     };
     let pairs = paired_by_stamp(
         &Frames::read(&left)?,
@@ -48,16 +48,16 @@ pub(super) fn open(
     })
 }
 
-fn rig(left: &Path, right: &Path) -> Result<StereoRig, DatasetError> {
-    let (left, body_from_left) = sensor(&left.join("sensor.yaml"))?;
-    let right_file = right.join("sensor.yaml");
-    let (right, body_from_right) = sensor(&right_file)?;
+/// The rig of two files `sensor.yaml`.
+pub(crate) fn rig(left_file: &Path, right_file: &Path) -> Result<StereoRig, DatasetError> {
+    let (left, body_from_left) = sensor(left_file)?;
+    let (right, body_from_right) = sensor(right_file)?;
     let right_from_left = body_from_right.inverse() * body_from_left;
     if right_from_left.translation.vector.norm() < 1e-6 {
         return Err(DatasetError {
             key: Some("T_BS".to_owned()),
             ..DatasetError::file(
-                &right_file,
+                right_file,
                 "the cameras must stand apart, but the baseline is zero",
             )
         });

@@ -65,14 +65,14 @@ fn first_sizes_px(left: &Path, pairs: &[PairFiles]) -> Result<[(u32, u32); 2], D
 }
 
 /// The two projection matrices, each with its line in the file.
-struct Calibration {
+pub(crate) struct Calibration {
     file: PathBuf,
     left: (usize, Matrix3x4<f64>),
     right: (usize, Matrix3x4<f64>),
 }
 
 impl Calibration {
-    fn read(file: &Path) -> Result<Self, DatasetError> {
+    pub(crate) fn read(file: &Path) -> Result<Self, DatasetError> {
         let text = text::read(file)?;
         let find = |key: &str| {
             text::lines(&text)
@@ -97,7 +97,7 @@ impl Calibration {
     }
 
     /// Both cameras are rectified: they differ by where they stand alone.
-    fn rig(&self, sizes_px: [(u32, u32); 2]) -> Result<StereoRig, DatasetError> {
+    pub(crate) fn rig(&self, sizes_px: [(u32, u32); 2]) -> Result<StereoRig, DatasetError> {
         let (left, left_from_world) = camera(&self.left.1, sizes_px[0]);
         let (right, right_from_world) = camera(&self.right.1, sizes_px[1]);
         let translation = right_from_world - left_from_world;

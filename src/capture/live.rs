@@ -11,13 +11,14 @@
 //! second, so that the estimate is bridged and published all the same.
 
 use super::camera::{CameraError, Clock, Frame, Loss, Losses, monotonic_ns, realtime_ns};
-use super::clock::{ClockEvent, ClockMap};
+use super::clock::{ClockEstimate, ClockEvent, ClockMap};
 use super::pairing::{Candidate, PairBy, Paired, Pairer, Skew, WhyUnmatched};
 use super::settings::{Clocks, Settings, Stamps};
 use super::supervisor::{Opener, Supervisor, open_patiently};
 use super::{PairEvent, PairSource, Side, StereoPair, Unusable};
 use crate::image::GrayImage;
 use std::collections::VecDeque;
+use std::sync::atomic::{AtomicI64, Ordering};
 use std::sync::{Arc, Condvar, Mutex, MutexGuard, PoisonError};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant};
@@ -77,12 +78,16 @@ pub struct CameraStatus {
     pub reconnects: u64,
     /// When the last frame arrived, CLOCK_MONOTONIC, ns; 0 before the first.
     pub last_arrived_ns: i64,
+    /// When its thread last looked at it, CLOCK_MONOTONIC, ns: a thread that hangs does not.
+    pub last_look_ns: i64,
     /// Frames that were lost, by kind.
     pub losses: Losses,
     /// Frames without a partner.
     pub unmatched: u64,
     /// Times that its clock was set or began anew.
     pub clock_steps: u64,
+    /// How its clock stands to the host's, where it has one of its own.
+    pub clock: Option<ClockEstimate>,
 }
 
 /// What is known about both cameras and their pairs. Counters never fall.
@@ -94,6 +99,10 @@ pub struct Snapshot {
     pub pairs: u64,
     /// Pairs dropped because the stages were late.
     pub dropped: u64,
+    /// Pairs that wait for the stages.
+    pub waiting: usize,
+    /// Time between two pairs, as it usually is, ns; 0 while it is not known.
+    pub period_ns: i64,
 }
 
 /// When a pair was taken.
@@ -290,10 +299,18 @@ impl Monitor {
     #[must_use]
     pub fn snapshot(&self) -> Snapshot {
         let inner = self.0.lock();
+        let mut cameras = inner.cameras.clone();
+        let looks = self.0.looks_ns.iter().zip(&inner.clocks);
+        for (camera, (look_ns, clock)) in cameras.iter_mut().zip(looks) {
+            camera.last_look_ns = look_ns.load(Ordering::Relaxed);
+            camera.clock = clock.estimate();
+        }
         Snapshot {
-            cameras: inner.cameras.clone(),
+            cameras,
             pairs: inner.pairs,
             dropped: inner.dropped,
+            waiting: inner.waiting(),
+            period_ns: inner.usual_period_ns,
         }
     }
 
@@ -311,6 +328,12 @@ impl Monitor {
         std::mem::take(&mut self.0.lock().journal).into()
     }
 
+    /// Waits; true if the run ended meanwhile.
+    #[must_use]
+    pub fn waits_out(&self, time: Duration) -> bool {
+        self.0.waits_out(time)
+    }
+
     /// Ends the run: the source has no more events.
     pub fn stop(&self) {
         self.0.stop();
@@ -323,6 +346,8 @@ pub(super) struct Shared {
     settings: Settings,
     inner: Mutex<Inner>,
     changed: Condvar,
+    /// When each camera's thread last showed itself, CLOCK_MONOTONIC.
+    looks_ns: [AtomicI64; 2],
 }
 
 #[derive(Debug)]
@@ -402,6 +427,7 @@ impl Shared {
             settings,
             inner: Mutex::new(inner),
             changed: Condvar::new(),
+            looks_ns: [(); 2].map(|()| AtomicI64::new(monotonic_ns())),
         }
     }
 
@@ -415,7 +441,9 @@ impl Shared {
         waited.map_or_else(|e| e.into_inner().0, |(inner, _)| inner)
     }
 
-    pub(super) fn is_over(&self) -> bool {
+    /// A camera's thread shows itself, and is told whether the run is over.
+    pub(super) fn look(&self, side: Side) -> bool {
+        self.looks_ns[side as usize].store(monotonic_ns(), Ordering::Relaxed);
         self.lock().is_over
     }
 
@@ -461,7 +489,13 @@ impl Shared {
         cause.clone_into(&mut status.cause);
         drop(inner);
         if is_new {
-            tracing::warn!(camera, state = state.as_str(), cause, "camera");
+            let state = state.as_str();
+            tracing::warn!(
+                camera,
+                state,
+                cause,
+                "the {camera} camera is {state}: {cause}"
+            );
         }
     }
 
@@ -477,7 +511,8 @@ impl Shared {
         status.state = State::Opening;
         status.cause.clear();
         drop(inner);
-        tracing::info!(camera = name_of(side), "camera opened anew");
+        let camera = name_of(side);
+        tracing::info!(camera, "the {camera} camera was opened anew");
     }
 
     pub(super) fn lost(&self, side: Side, kind: Loss, frames: u64) {
@@ -499,7 +534,8 @@ impl Shared {
         drop(inner);
         self.changed.notify_all();
         if was != State::Streaming {
-            tracing::info!(camera = name_of(side), "camera streaming");
+            let camera = name_of(side);
+            tracing::info!(camera, "the {camera} camera streams");
         }
     }
 }
@@ -546,7 +582,8 @@ impl Inner {
         match mapped.event {
             Some(ClockEvent::Stepped { by_ns }) => {
                 self.cameras[at].clock_steps += 1;
-                tracing::warn!(camera = name_of(side), by_ns, "the camera's clock was set");
+                let camera = name_of(side);
+                tracing::warn!(camera, by_ns, "the {camera} camera's clock was set");
             }
             Some(ClockEvent::Wrapped { modulus_ns }) => {
                 tracing::debug!(
@@ -649,8 +686,12 @@ impl Inner {
         stamp_ns
     }
 
+    /// Pairs that wait for the stages.
+    fn waiting(&self) -> usize {
+        self.ready.iter().filter(|event| is_pair(event)).count()
+    }
+
     fn queue(&mut self, event: PairEvent) {
-        let is_pair = |event: &PairEvent| matches!(event, PairEvent::Pair(_));
         if !is_pair(&event) {
             // Of events without images one is enough.
             if self.ready.back().is_some_and(|last| !is_pair(last)) {
@@ -659,8 +700,7 @@ impl Inner {
             self.ready.push_back(event);
             return;
         }
-        let waiting = self.ready.iter().filter(|event| is_pair(event)).count();
-        if waiting < self.delivery.queue {
+        if self.waiting() < self.delivery.queue {
             self.ready.push_back(event);
             return;
         }
@@ -731,6 +771,10 @@ impl Inner {
             self.journal.push_back(entry);
         }
     }
+}
+
+fn is_pair(event: &PairEvent) -> bool {
+    matches!(event, PairEvent::Pair(_))
 }
 
 fn entry(side: Side, frame: &Candidate<Waiting>, fate: Fate) -> Entry {

@@ -23,11 +23,11 @@ pub mod dataset;
 pub mod decode;
 mod decode_error;
 pub mod drivers;
-mod euroc;
+pub(crate) mod euroc;
 mod euroc_frames;
 pub mod files;
 mod jpeg;
-mod kitti;
+pub(crate) mod kitti;
 pub mod live;
 #[cfg(feature = "mcap")]
 pub mod mcap;
@@ -42,7 +42,7 @@ mod supervisor;
 mod text;
 #[cfg(feature = "v4l")]
 pub mod v4l2;
-mod yaml;
+pub(crate) mod yaml;
 
 pub use dataset::{Dataset, DatasetError, Layout};
 pub use live::LiveSource;

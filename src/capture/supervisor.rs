@@ -96,7 +96,7 @@ impl Supervisor {
             return Ended::Failed(e);
         }
         let mut last_frame = Instant::now();
-        while !self.shared.is_over() {
+        while !self.shared.look(self.side) {
             while let Some(image) = self.shared.take_spare(self.side) {
                 source.recycle(image);
             }
@@ -128,7 +128,7 @@ impl Supervisor {
     fn reopen(&self, identity: &str, pause: &mut Duration) -> Option<Box<dyn FrameSource>> {
         let mut told = String::new();
         loop {
-            if self.shared.waits_out(*pause) {
+            if self.shared.look(self.side) || self.shared.waits_out(*pause) {
                 return None;
             }
             *pause = (*pause * 2).min(self.settings.retry().max(FIRST_PAUSE));

@@ -13,14 +13,14 @@ const MAX_DEPTH: usize = 32;
 
 /// A value and the line it starts on, counted from 1.
 #[derive(Debug)]
-pub(super) struct Node {
-    pub(super) line: usize,
-    pub(super) value: Value,
+pub(crate) struct Node {
+    pub(crate) line: usize,
+    pub(crate) value: Value,
 }
 
 /// What a node holds.
 #[derive(Debug)]
-pub(super) enum Value {
+pub(crate) enum Value {
     Scalar(String),
     List(Vec<Node>),
     Map(Vec<(String, Node)>),
@@ -28,13 +28,13 @@ pub(super) enum Value {
 
 /// A file whose values are asked for by key.
 #[derive(Debug)]
-pub(super) struct YamlFile {
+pub(crate) struct YamlFile {
     file: PathBuf,
     root: Node,
 }
 
 impl YamlFile {
-    pub(super) fn read(file: &Path) -> Result<Self, DatasetError> {
+    pub(crate) fn read(file: &Path) -> Result<Self, DatasetError> {
         Self::parse(file, &text::read(file)?)
     }
 
@@ -68,12 +68,12 @@ impl YamlFile {
     }
 
     /// The value of a key of the outermost map, if it is there.
-    pub(super) fn get(&self, key: &str) -> Option<&Node> {
+    pub(crate) fn get(&self, key: &str) -> Option<&Node> {
         self.root.get(key)
     }
 
     /// The value of a key of the outermost map.
-    pub(super) fn need(&self, key: &str) -> Result<&Node, DatasetError> {
+    pub(crate) fn need(&self, key: &str) -> Result<&Node, DatasetError> {
         self.get(key).ok_or_else(|| DatasetError {
             key: Some(key.to_owned()),
             ..DatasetError::file(&self.file, "the key is missing")
@@ -81,12 +81,12 @@ impl YamlFile {
     }
 
     /// The error that the value of `key` at `node` is wrong.
-    pub(super) fn wrong(&self, node: &Node, key: &str, cause: impl Into<String>) -> DatasetError {
+    pub(crate) fn wrong(&self, node: &Node, key: &str, cause: impl Into<String>) -> DatasetError {
         DatasetError::key(&self.file, node.line, key, cause)
     }
 
     /// The text of `key`.
-    pub(super) fn word(&self, key: &str) -> Result<&str, DatasetError> {
+    pub(crate) fn word(&self, key: &str) -> Result<&str, DatasetError> {
         let node = self.need(key)?;
         match &node.value {
             Value::Scalar(word) => Ok(word),
@@ -95,7 +95,7 @@ impl YamlFile {
     }
 
     /// The finite numbers in `node`, which is a list, possibly of lists.
-    pub(super) fn numbers(&self, node: &Node, key: &str) -> Result<Vec<f64>, DatasetError> {
+    pub(crate) fn numbers(&self, node: &Node, key: &str) -> Result<Vec<f64>, DatasetError> {
         let Value::List(items) = &node.value else {
             return Err(self.wrong(node, key, "a list of numbers was expected"));
         };
@@ -124,7 +124,7 @@ fn finite(word: &str) -> Option<f64> {
 
 impl Node {
     /// The value of a key, if this is a map that has it.
-    pub(super) fn get(&self, key: &str) -> Option<&Self> {
+    pub(crate) fn get(&self, key: &str) -> Option<&Self> {
         match &self.value {
             Value::Map(entries) => entries.iter().find(|(k, _)| k == key).map(|(_, v)| v),
             _ => None,

@@ -4,6 +4,7 @@ use super::Failure;
 use super::live::Setup;
 use crate::capture::settings::Driver;
 use crate::geometry::{Severity, check_rig};
+use crate::service::realtime;
 use std::path::PathBuf;
 use std::time::Duration;
 
@@ -161,18 +162,29 @@ fn machine_findings(setup: &Setup) -> Vec<Finding> {
         findings.push(packet_socket());
         findings.push(receive_buffer());
     }
+    let service = &setup.config.service;
     findings.push(limit(
         "real-time priority",
         "Max realtime priority",
-        1,
-        "the scheduler may hold frames up",
+        u64::from(service.priority),
+        "the scheduler may hold frames up: give the unit LimitRTPRIO=, or this user rtprio in limits.conf",
     ));
-    findings.push(limit(
-        "locked memory",
-        "Max locked memory",
-        512 << 20,
-        "memory may be paged out",
-    ));
+    if service.lock_memory {
+        findings.push(limit(
+            "locked memory",
+            "Max locked memory",
+            512 << 20,
+            "memory may be paged out: give the unit LimitMEMLOCK=, or this user memlock in limits.conf",
+        ));
+    }
+    // On a thread of its own: a binding would stay.
+    let bound = std::thread::scope(|scope| {
+        let binding = scope.spawn(|| realtime::bind(&service.processors));
+        binding.join().unwrap_or(Ok(()))
+    });
+    if let Err(cause) = bound {
+        findings.push(finding("bound processors", Verdict::Warning, cause));
+    }
     let processors = std::thread::available_parallelism().map_or(1, std::num::NonZero::get);
     let verdict = if processors < 4 {
         Verdict::Warning
@@ -231,6 +243,9 @@ fn limit(what: &'static str, name: &str, wanted: u64, otherwise: &str) -> Findin
         Some(number) => number.parse().unwrap_or(0),
         None => 0,
     };
+    if wanted == 0 {
+        return finding(what, Verdict::Good, "not asked for");
+    }
     // Root is not held to the limit.
     if granted >= wanted || rustix::process::geteuid().is_root() {
         return finding(what, Verdict::Good, "granted");

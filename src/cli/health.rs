@@ -5,20 +5,36 @@ use crate::estimation::Status;
 use crate::output::health::{CameraState, HealthMessage};
 use crate::output::message::status_code;
 use crate::pipeline::Delivery;
+use crate::service::budget::FrameBudget;
 use std::time::{Duration, Instant};
 
 /// How often health is published, at least.
 const HEALTH_PERIOD: Duration = Duration::from_secs(1);
 
 /// The state that goes to `visod/health`: every second, and whenever the status changes.
-#[derive(Default)]
 pub(crate) struct Health {
+    started: Instant,
     message: HealthMessage,
     status: Option<Status>,
     changed: bool,
     published: Option<Instant>,
     busy_total: Duration,
     camera_states: (u32, u32),
+}
+
+impl Default for Health {
+    /// A daemon that starts now.
+    fn default() -> Self {
+        Self {
+            started: Instant::now(),
+            message: HealthMessage::default(),
+            status: None,
+            changed: false,
+            published: None,
+            busy_total: Duration::ZERO,
+            camera_states: (0, 0),
+        }
+    }
 }
 
 impl Health {
@@ -33,6 +49,7 @@ impl Health {
         let ns = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
         let m = &mut self.message;
         m.odometry_status = status_code(odometry.status);
+        m.restarts = u64::from(odometry.epoch);
         m.pairs_processed += 1;
         m.left_state = CameraState::Streaming as u32;
         m.right_state = CameraState::Streaming as u32;
@@ -73,11 +90,24 @@ impl Health {
         m.pairs_dropped = cameras.dropped;
     }
 
+    /// Takes note of how the time goes.
+    pub(crate) fn add_budget(&mut self, budget: &FrameBudget, period_ns: i64) {
+        let m = &mut self.message;
+        let permille = (budget.share() * 1000.0).round() as u32;
+        self.changed |= m.features_permille != permille;
+        m.features_permille = permille;
+        m.degraded_mode = u32::from(permille < 1000);
+        m.budget_ns = u64::try_from(period_ns).unwrap_or(0);
+        m.over_budget = budget.over_period();
+        m.overruns = budget.overruns();
+    }
+
     /// The message, with what the publisher knows.
     pub(crate) fn message(&self, subscribers: usize, publish_failures: u64) -> HealthMessage {
         HealthMessage {
             subscribers: subscribers as u64,
             publish_failures,
+            uptime_ns: u64::try_from(self.started.elapsed().as_nanos()).unwrap_or(u64::MAX),
             ..self.message
         }
     }

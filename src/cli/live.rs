@@ -6,6 +6,7 @@ use crate::capture::live::{Delivery, LiveSource, Monitor};
 use crate::capture::{Opener, Side, drivers};
 use crate::config::Config;
 use crate::geometry::{StereoRig, load_rig};
+use crate::service::realtime;
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -50,10 +51,17 @@ impl Setup {
 
     /// Opens the cameras.
     pub(crate) fn open(&self, delivery: Delivery, stop: &Stop) -> Result<LiveSource, Failure> {
-        LiveSource::open(&self.config.capture, self.openers.clone(), delivery, || {
-            stop.is_asked_for()
-        })
-        .map_err(failure)
+        let priority = self.config.service.priority;
+        // The cameras' threads inherit it.
+        let (source, granted) = realtime::with_priority(priority, || {
+            LiveSource::open(&self.config.capture, self.openers.clone(), delivery, || {
+                stop.is_asked_for()
+            })
+        });
+        if let Err(cause) = granted {
+            tracing::warn!("not granted: {cause}");
+        }
+        source.map_err(failure)
     }
 }
 
@@ -104,17 +112,4 @@ impl Stop {
             .map(drop)
             .map_err(|e| Failure::other(format!("a thread cannot be started: {e}")))
     }
-}
-
-/// Says on stderr what happens to the cameras; `RUST_LOG` says how much.
-pub(crate) fn log_to_stderr() {
-    let filter = tracing_subscriber::EnvFilter::try_from_default_env()
-        .unwrap_or_else(|_| tracing_subscriber::EnvFilter::new("info"));
-    // Whoever has set up a log already keeps it.
-    let _ = tracing_subscriber::fmt()
-        .with_env_filter(filter)
-        .with_writer(std::io::stderr)
-        .with_ansi(false)
-        .with_target(false)
-        .try_init();
 }

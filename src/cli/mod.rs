@@ -1,5 +1,10 @@
 //! The command line: one file a command.
 
+mod attendant;
+mod calibrate;
+#[cfg(feature = "opencv")]
+mod calibrate_live;
+mod calibrate_views;
 mod cameras;
 mod check;
 mod demo;
@@ -15,6 +20,7 @@ mod record;
 mod replay;
 mod report;
 mod rig;
+mod rig_convert;
 mod run;
 mod session;
 mod simulate;
@@ -48,6 +54,7 @@ enum Command {
     Report(report::Args),
     Features(features::Args),
     Montecarlo(Box<montecarlo::Args>),
+    Calibrate(Box<calibrate::Args>),
     Rig(rig::Args),
     Cameras(cameras::Args),
     Check(check::Args),
@@ -74,6 +81,12 @@ impl Failure {
     }
 }
 
+/// The whole command line, for what is generated from it: manual pages and completions.
+#[must_use]
+pub fn command() -> clap::Command {
+    <Cli as clap::CommandFactory>::command()
+}
+
 /// Runs the command line of this process. Exit code: 0 success, 2 bad usage or configuration, 1 any
 /// other failure.
 pub fn main() -> ExitCode {
@@ -88,6 +101,7 @@ pub fn main() -> ExitCode {
         Command::Report(args) => report::run(&args),
         Command::Features(args) => features::run(&args),
         Command::Montecarlo(args) => montecarlo::run(&args),
+        Command::Calibrate(args) => calibrate::run(&args),
         Command::Rig(args) => rig::run(&args),
         Command::Cameras(args) => cameras::run(&args),
         Command::Check(args) => check::run(&args),

@@ -1,10 +1,12 @@
 //! `visod record`: cameras in, a recording out.
 
-use super::live::{Setup, Stop, log_to_stderr};
+use super::live::{Setup, Stop};
 use super::{Failure, progress, summary};
+use crate::capture::clock::ClockEstimate;
 use crate::capture::live::{Delivery, Entry, Fate, Monitor, Overflow, Snapshot};
 use crate::capture::recorder::{RecordError, Recorder};
 use crate::capture::{PairEvent, PairSource};
+use crate::service::log;
 use std::path::PathBuf;
 
 /// Pairs that may wait for the disk; at 1280×960 px, 160 MB.
@@ -44,10 +46,11 @@ struct Recorded {
     written: [u64; 2],
     unmatched: [u64; 2],
     lost: [u64; 2],
+    clocks: [Option<ClockEstimate>; 2],
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    log_to_stderr();
+    log::start();
     let stop = Stop::on_signals()?;
     let setup = Setup::load(&args.config)?;
     let mut recorder = Recorder::create(&args.out, &setup.rig).map_err(failure)?;
@@ -111,6 +114,7 @@ fn print(args: &Args, recorder: &Recorder, cameras: &Snapshot) -> Result<(), Fai
         written: [recorder.count(); 2],
         unmatched: of(|c| c.unmatched),
         lost: of(|c| c.losses.in_transport() + c.losses.unusable()),
+        clocks: cameras.cameras.each_ref().map(|c| c.clock),
     };
     if args.json {
         let text = serde_json::to_string_pretty(&recorded).map_err(Failure::other)?;

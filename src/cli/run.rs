@@ -1,16 +1,19 @@
 //! `visod run`: the daemon. Cameras in, poses over shared memory out, until it is told to stop.
 
-use super::live::{Setup, Stop, log_to_stderr};
+use super::attendant::{Attendant, ask_for_resources};
+use super::live::{Setup, Stop};
 use super::session::{Session, unwritable};
 use super::{Failure, summary};
 use crate::capture::live::{Delivery, Overflow};
+use crate::service::log;
 use std::path::PathBuf;
 
 /// Follow two cameras and publish pose and covariance until stopped.
 ///
 /// The configuration names the rig and the cameras: `rig`, `[camera.left]` and `[camera.right]`. A
 /// camera that fails is opened anew while the other one and the publication go on. Stopped by SIGINT
-/// (Ctrl-C) or SIGTERM, it prints what the run came to.
+/// (Ctrl-C) or SIGTERM, it prints what the run came to. SIGHUP has service.deadline_s and service.trim read
+/// anew. Started by systemd, it tells it when it is ready, how it is, and that it is alive.
 #[derive(clap::Args)]
 #[command(after_help = "Example: visod run --config visod.toml")]
 pub(crate) struct Args {
@@ -38,12 +41,17 @@ pub(crate) struct Args {
     /// Print the run's figures as JSON.
     #[arg(long)]
     json: bool,
+    /// Hang after that many rows, so that tests see the watchdog bite.
+    #[arg(long, value_name = "N", hide = true)]
+    hang_after: Option<u64>,
 }
 
 pub(crate) fn run(args: &Args) -> Result<(), Failure> {
-    log_to_stderr();
+    log::start();
     let stop = Stop::on_signals()?;
     let setup = Setup::load(&args.config)?;
+    let attendant = Attendant::new(args.config.clone(), setup.config.clone())?;
+    ask_for_resources(&setup.config.service);
     let mut session = Session::new(setup.config.clone(), setup.rig.clone());
     session.write_csv(args.odometry.as_deref())?;
     session.write_trajectory(args.trajectory.as_deref())?;
@@ -56,10 +64,17 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         keeps_journal: false,
     };
     let source = setup.open(delivery, &stop)?;
-    session.watch(source.monitor());
+    session.watch(source.monitor(), attendant.pulse());
     session.write_mcap(args.mcap.as_deref())?;
+    if let Some(rows) = args.hang_after {
+        session.on_each_row(hang_after(rows));
+    }
+    let attending = attendant.attend(source.monitor())?;
     stop.end_run(source.monitor(), args.seconds)?;
-    let finished = session.run(source)?;
+    let finished = session.run(source);
+    // The last thing that systemd is told; a panic in it has been reported already.
+    let _ = attending.join();
+    let finished = finished?;
     let json = summary::to_json(&args.config, &finished).map_err(Failure::other)?;
     if let Some(file) = &args.summary {
         std::fs::write(file, format!("{json}\n")).map_err(|e| unwritable(file, &e))?;
@@ -70,6 +85,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
         print!("{}", summary::to_text(&finished));
     }
     Ok(())
+}
+
+/// What hangs at the given row.
+fn hang_after(rows: u64) -> impl FnMut(&crate::output::row::OdometryRow) {
+    let mut seen = 0;
+    move |_| {
+        seen += 1;
+        if seen >= rows {
+            loop {
+                std::thread::park();
+            }
+        }
+    }
 }
 
 /// Publishing is what the daemon is for: without, it does not start.

@@ -1,5 +1,6 @@
 //! What a run of the pipeline writes and publishes, for every command that runs it.
 
+use super::attendant::Pulse;
 #[cfg(feature = "ipc")]
 use super::health::Health;
 use super::{Failure, progress};
@@ -15,12 +16,14 @@ use crate::output::mcap::McapRecorder;
 use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
-use crate::pipeline::{self, Delivery, Method, RunFigures, Statistics};
+use crate::pipeline::{self, Delivery, Method, RunFigures, Share, Statistics};
+use crate::service::budget::{FrameBudget, Timing};
 use indicatif::ProgressBar;
 use std::fs::File;
 use std::io;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
+use std::time::Duration;
 
 /// Sees each row as it comes.
 type RowWatcher = Box<dyn FnMut(&OdometryRow)>;
@@ -41,8 +44,16 @@ pub(crate) struct Session {
     published: u64,
     publish_failures: u64,
     each_row: Option<RowWatcher>,
-    live: Option<Monitor>,
+    live: Option<Live>,
     warned_of_first_order: bool,
+}
+
+/// What there is besides where the pairs come from cameras.
+struct Live {
+    cameras: Monitor,
+    pulse: Pulse,
+    budget: FrameBudget,
+    share: Share,
 }
 
 /// What a run came to.
@@ -96,9 +107,16 @@ impl Session {
         }
     }
 
-    /// The pairs come from cameras: their own times go out, and their state.
-    pub(crate) fn watch(&mut self, cameras: Monitor) {
-        self.live = Some(cameras);
+    /// The pairs come from cameras: their own times go out, and their state; `pulse` shows each row, and
+    /// features are trimmed where time is short.
+    pub(crate) fn watch(&mut self, cameras: Monitor, pulse: Pulse) {
+        let service = &self.config.service;
+        self.live = Some(Live {
+            cameras,
+            pulse,
+            budget: FrameBudget::new(service.deadline(), service.trim),
+            share: Share::default(),
+        });
     }
 
     /// Writes the odometry CSV.
@@ -169,8 +187,13 @@ impl Session {
         .ok_or_else(|| {
             Failure::usage("the rig's cameras stand behind one another: no depth can be measured")
         })?;
+        let share = self.live.as_ref().map(|live| live.share.clone());
+        let bound = |extractor| match &share {
+            Some(share) => share.bound(extractor),
+            None => extractor,
+        };
         let extractors = (0..self.config.pipeline.worker_count())
-            .map(|_| features::extractor(&self.config.features))
+            .map(|_| features::extractor(&self.config.features).map(bound))
             .collect::<Result<Vec<_>, _>>()
             .map_err(|e| Failure::usage(format!("features.{}: {}", e.key, e.cause)))?;
         let bar = progress::pairs(source.len_hint());
@@ -222,7 +245,7 @@ impl Session {
         if let Some(publisher) = self.publisher {
             publisher.close();
         }
-        let cameras = self.live.as_ref().map(Monitor::snapshot);
+        let cameras = self.live.as_ref().map(|live| live.cameras.snapshot());
         let mut figures = statistics.figures();
         figures.counts.dropped = cameras.as_ref().map_or(0, |c| c.dropped);
         Ok(Finished {
@@ -264,6 +287,9 @@ impl Session {
         let total_ms = delivery.latencies.total.as_secs_f64() * 1e3;
         let latency_ms = self.live.is_some().then_some(total_ms);
         let row = OdometryRow::new(delivery.odometry, latency_ms);
+        if let Some(live) = &mut self.live {
+            live.see(delivery);
+        }
         self.send(delivery);
         if let Some((file, csv)) = &mut self.csv {
             csv.write_row(&row)
@@ -315,7 +341,9 @@ impl Session {
         }
         self.health.add(delivery);
         if let Some(live) = &self.live {
-            self.health.add_cameras(&live.snapshot());
+            let cameras = live.cameras.snapshot();
+            self.health.add_cameras(&cameras);
+            self.health.add_budget(&live.budget, cameras.period_ns);
         }
         if self.health.is_due() {
             let message = self
@@ -338,6 +366,7 @@ impl Session {
         };
         let now_ns = monotonic_ns();
         let (taken_ns, complete_ns) = live
+            .cameras
             .captured(odometry.sequence)
             .map_or((now_ns, now_ns), |at| (at.monotonic_ns, at.complete_ns));
         let captured = CaptureTime::Live {
@@ -351,13 +380,40 @@ impl Session {
     fn send(&mut self, _: &Delivery<'_>) {}
 }
 
+impl Live {
+    /// Takes note of a row: how long it took, and whether pairs wait meanwhile.
+    fn see(&mut self, delivery: &Delivery<'_>) {
+        let (deadline, trims) = self.pulse.beat();
+        self.budget.set(deadline, trims);
+        if delivery.unusable.is_some() {
+            return;
+        }
+        let cameras = self.cameras.snapshot();
+        let took = &delivery.latencies;
+        let changed = self.budget.add(&Timing {
+            total: took.total,
+            busy: took.features + took.matching + took.estimation,
+            period: Duration::from_nanos(u64::try_from(cameras.period_ns).unwrap_or(0)),
+            waiting: cameras.waiting,
+        });
+        let before = self.share.get();
+        let now = changed.unwrap_or(self.budget.share());
+        self.share.set(now);
+        if now < before {
+            tracing::warn!(share = now, "pairs wait: fewer features are looked for");
+        } else if now > before {
+            tracing::info!(share = now, "there is time for more features again");
+        }
+    }
+}
+
 /// The stages' latencies as the message has them.
 #[cfg(feature = "ipc")]
 fn latencies(
     took: &pipeline::StageLatencies,
     capture_ns: u64,
 ) -> crate::output::message::Latencies {
-    let ns = |d: std::time::Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
+    let ns = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
     crate::output::message::Latencies {
         capture_ns,
         features_ns: ns(took.features),

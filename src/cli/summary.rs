@@ -33,6 +33,8 @@ struct CameraSummary<'a> {
     unmatched: u64,
     reconnects: u64,
     clock_steps: u64,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    clock: Option<crate::capture::clock::ClockEstimate>,
     lost: std::collections::BTreeMap<&'static str, u64>,
 }
 
@@ -46,6 +48,7 @@ impl<'a> CameraSummary<'a> {
             unmatched: camera.unmatched,
             reconnects: camera.reconnects,
             clock_steps: camera.clock_steps,
+            clock: camera.clock,
             lost: camera.losses.iter().map(|(k, n)| (k.as_str(), n)).collect(),
         }
     }

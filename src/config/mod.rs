@@ -5,7 +5,7 @@
 
 use crate::settings::SettingError;
 use crate::toml_file::{TomlError, TomlText};
-use crate::{capture, estimation, features, matching, output, pipeline};
+use crate::{capture, estimation, features, matching, output, pipeline, service};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -31,6 +31,8 @@ pub struct Config {
     pub pipeline: pipeline::Settings,
     /// Where the results are published.
     pub publish: output::publication::Settings,
+    /// How the daemon behaves as a service.
+    pub service: service::Settings,
 }
 
 impl Config {
@@ -70,6 +72,7 @@ impl Config {
             ("estimation", config.estimation.check()),
             ("pipeline", config.pipeline.check()),
             ("publish", config.publish.check()),
+            ("service", config.service.check()),
         ] {
             checked.map_err(|SettingError { key, cause }| {
                 text.wrong(&format!("{table}.{key}"), cause)

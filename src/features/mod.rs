@@ -83,6 +83,12 @@ pub trait Extractor: Send {
     /// # Errors
     /// The detector could not do its job; a featureless image is no error.
     fn extract(&mut self, image: &GrayImage, features: &mut Features) -> Result<(), ExtractError>;
+
+    /// Looks from now on for that share of the features, 0 to 1: those that come first where there is a
+    /// budget. A detector that cannot looks for all.
+    fn set_share(&mut self, share: f32) {
+        let _ = share;
+    }
 }
 
 /// Why a detector could not do its job.

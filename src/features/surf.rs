@@ -92,6 +92,7 @@ impl Settings {
 #[derive(Debug)]
 pub struct Surf {
     settings: Settings,
+    share: f32,
     compass: Compass,
     integral: IntegralImage,
     detector: Detector,
@@ -112,6 +113,7 @@ impl Surf {
         settings.check()?;
         Ok(Self {
             settings,
+            share: 1.0,
             compass: Compass::new(),
             integral: IntegralImage::default(),
             detector: Detector::default(),
@@ -140,6 +142,18 @@ impl Surf {
         let floats = kept * self.settings.descriptor_len();
         make_room(&mut features.descriptors, floats);
         self.describer.make_room(image, self.search().largest_px());
+    }
+
+    /// Keypoints to be kept of those found, 0 for all: the budget's share.
+    fn budget(&self, found: usize) -> usize {
+        if self.share >= 1.0 {
+            return self.settings.budget;
+        }
+        let all = match self.settings.budget {
+            0 => found,
+            budget => budget.min(found),
+        };
+        ((all as f32 * self.share) as usize).max(1)
     }
 
     /// Gives direction, σ and descriptor to the keypoints; drops those so near to the border that
@@ -216,7 +230,8 @@ impl Extractor for Surf {
         self.candidates.clear();
         self.detector
             .detect(&self.integral, self.search(), &mut self.candidates);
-        let (size, budget) = ((image.width(), image.height()), self.settings.budget);
+        let size = (image.width(), image.height());
+        let budget = self.budget(self.candidates.len());
         self.found.clear();
         self.draw.confirm(
             &self.candidates,
@@ -229,6 +244,10 @@ impl Extractor for Surf {
         self.spread.keep(&mut self.found, budget, size, kept);
         self.describe(image, features);
         Ok(())
+    }
+
+    fn set_share(&mut self, share: f32) {
+        self.share = share;
     }
 }
 

@@ -34,16 +34,17 @@
 //! | 168 | `u64` | `pairs_degraded` | estimates of status degraded |
 //! | 176 | `u64` | `pairs_lost` | estimates of status lost |
 //! | 184 | `u64` | `restarts` | times that the odometry frame began anew |
-//! | 192 | `u64` | `over_budget` | pairs that took longer than the frame budget |
+//! | 192 | `u64` | `over_budget` | pairs that took the stages longer than `budget_ns`; they overlap, so that this alone delays nothing |
 //! | 200 | `u64` | `publish_failures` | messages that could not be handed over |
 //! | 208 | `u64` | `budget_ns` | time between two pairs that the stages may use; 0 without one |
 //! | 216 | `u64` | `busy_mean_ns` | time used a pair, mean since the last of these messages |
 //! | 224 | `u64` | `busy_max_ns` | time used a pair, greatest since the last of these messages |
 //! | 232 | `u64` | `uptime_ns` | since the daemon's start |
 //! | 240 | `u64` | `subscribers` | subscribers of `visod/odometry` |
-//! | 248 | `u32` | `degraded_mode` | 0 none, else the number of the pipeline's degraded mode |
-//! | 252 | `u32` | `reserved` | 0 |
-//! | 256 | `[u64; 3]` | `reserved_2` | 0 |
+//! | 248 | `u32` | `degraded_mode` | 0 none, 1 fewer features are looked for, since pairs had to wait |
+//! | 252 | `u32` | `features_permille` | share of the features that is looked for, thousandths |
+//! | 256 | `u64` | `overruns` | pairs whose estimate came after the deadline |
+//! | 264 | `[u64; 2]` | `reserved_2` | 0 |
 
 use super::message::{MessageError, check_code, check_header};
 #[cfg(feature = "ipc")]
@@ -118,8 +119,9 @@ pub struct HealthMessage {
     pub uptime_ns: u64,
     pub subscribers: u64,
     pub degraded_mode: u32,
-    pub reserved: u32,
-    pub reserved_2: [u64; 3],
+    pub features_permille: u32,
+    pub overruns: u64,
+    pub reserved_2: [u64; 2],
 }
 
 impl Default for HealthMessage {
@@ -161,8 +163,9 @@ impl Default for HealthMessage {
             uptime_ns: 0,
             subscribers: 0,
             degraded_mode: 0,
-            reserved: 0,
-            reserved_2: [0; 3],
+            features_permille: 1000,
+            overruns: 0,
+            reserved_2: [0; 2],
         }
     }
 }
@@ -199,7 +202,7 @@ mod tests {
             left_lost_in_transport right_lost_in_transport left_unreadable right_unreadable
             left_unmatched right_unmatched pairs_processed pairs_unusable pairs_dropped
             pairs_degraded pairs_lost restarts over_budget publish_failures budget_ns busy_mean_ns
-            busy_max_ns uptime_ns subscribers degraded_mode reserved reserved_2);
+            busy_max_ns uptime_ns subscribers degraded_mode features_permille overruns reserved_2);
         let names: Vec<_> = documented.iter().map(|(o, _, f)| (*o, *f)).collect();
         assert_eq!(names, actual);
         assert_gapless(&documented, size_of::<HealthMessage>());

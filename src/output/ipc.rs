@@ -178,13 +178,21 @@ pub(super) fn open_node(
         .create::<Ipc>()
         .map_err(|e| {
             // iceoryx2 calls this an internal error.
-            match std::fs::read_dir(config.global.root_path().to_string()) {
-                Err(e) if e.kind() == std::io::ErrorKind::PermissionDenied => {
-                    failed("it belongs to another user, whom this process must run as".to_owned())
-                }
-                _ => failed(explain(&format!("{e:?}"))),
+            if belongs_to_another(&config.global.root_path().to_string()) {
+                failed("it belongs to another user, whom this process must run as".to_owned())
+            } else {
+                failed(explain(&format!("{e:?}")))
             }
         })
+}
+
+/// Whether a directory is another user's, or may not even be looked into.
+fn belongs_to_another(directory: &str) -> bool {
+    use std::os::unix::fs::MetadataExt;
+    let owner = std::fs::metadata(directory).map(|m| m.uid());
+    let is_closed = std::fs::read_dir(directory)
+        .is_err_and(|e| e.kind() == std::io::ErrorKind::PermissionDenied);
+    is_closed || owner.is_ok_and(|owner| owner != rustix::process::geteuid().as_raw())
 }
 
 /// iceoryx2's own configuration with what the settings say otherwise.

@@ -8,9 +8,11 @@ mod histogram;
 mod method;
 mod occupancy;
 mod statistics;
+mod trim;
 mod two_frame;
 mod windowed;
 
 pub use driver::{Delivery, PipelineError, Settings, StageLatencies, run};
 pub use method::{Described, DescribedPair, Method, StageTimes};
 pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};
+pub use trim::Share;

@@ -5,6 +5,7 @@
 //! both send at tick n after the first at which both are running. The stamps are the recording's, on
 //! clocks that may differ.
 
+use crate::capture::camera::monotonic_ns;
 use crate::capture::{Dataset, PairEvent, PairSource, ReadAhead, Side};
 use crate::image::GrayImage;
 use aravis::{FakeCamera, GvFakeCamera};
@@ -101,6 +102,22 @@ pub struct CameraClock {
     pub offset_ns: i64,
     /// Faster than the recording's, as a ratio less one.
     pub drift: f64,
+    /// What time it shows.
+    pub shows: Shows,
+}
+
+/// What time a simulated camera's clock shows.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum Shows {
+    /// The recording's: stamps are those of its pairs, however late a busy machine sends them.
+    #[default]
+    Recording,
+    /// When each frame is really taken, by this host's CLOCK_MONOTONIC: what is estimated from stamps can
+    /// be held against the truth.
+    Host {
+        /// When the clock was right, but for its offset, ns.
+        since_ns: i64,
+    },
 }
 
 /// One simulated camera; it serves until it is dropped.
@@ -279,6 +296,10 @@ impl Filler {
         let length_ns =
             self.images.timestamp_ns(count as usize - 1) - first_ns + self.period_us * 1000;
         let since_ns = round * length_ns + self.images.timestamp_ns(at) - first_ns;
+        let (first_ns, since_ns) = match self.clock.shows {
+            Shows::Recording => (first_ns, since_ns),
+            Shows::Host { since_ns } => (since_ns, monotonic_ns() - since_ns),
+        };
         let drifted_ns = (self.clock.drift * since_ns as f64).round() as i64;
         first_ns + since_ns + drifted_ns + self.clock.offset_ns
     }

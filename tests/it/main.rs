@@ -43,5 +43,8 @@ mod report;
 #[cfg(test)]
 mod samples;
 #[cfg(test)]
+#[cfg(all(feature = "aravis", feature = "ipc"))]
+mod service;
+#[cfg(test)]
 #[cfg(feature = "v4l")]
 mod v4l2;

@@ -143,8 +143,9 @@ class HealthMessage(ctypes.Structure):
         ("uptime_ns", ctypes.c_uint64),
         ("subscribers", ctypes.c_uint64),
         ("degraded_mode", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
-        ("reserved_2", ctypes.c_uint64 * 3),
+        ("features_permille", ctypes.c_uint32),
+        ("overruns", ctypes.c_uint64),
+        ("reserved_2", ctypes.c_uint64 * 2),
     ]
 
     @staticmethod
@@ -280,6 +281,8 @@ class Health:
     uptime_ns: int
     subscribers: int
     degraded_mode: int
+    features_permille: int
+    overruns: int
 
     @staticmethod
     def from_message(m: HealthMessage) -> "Health":
@@ -289,7 +292,7 @@ class Health:
             "message_number", "realtime_ns", "monotonic_ns", "pairs_processed", "pairs_unusable",
             "pairs_dropped", "pairs_degraded", "pairs_lost", "restarts", "over_budget",
             "publish_failures", "busy_mean_ns", "busy_max_ns", "uptime_ns", "subscribers",
-            "degraded_mode",
+            "degraded_mode", "features_permille", "overruns",
         )  # fmt: skip
         return Health(
             odometry_status=_word(STATUSES, m.odometry_status, "odometry_status"),

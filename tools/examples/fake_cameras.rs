@@ -55,6 +55,7 @@ impl Cameras {
             Side::Right => CameraClock {
                 offset_ns: (self.args.offset_ms * 1e6) as i64,
                 drift: self.args.drift_ppm * 1e-6,
+                ..CameraClock::default()
             },
         };
         let address = self
