@@ -7,8 +7,9 @@
 
 use super::bundle::TrackedPoint;
 use super::{StereoMeasurement, closed_form, sight};
+use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::{StereoRig, se3};
-use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix6, Point3, Vector3, Vector4, Vector6};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Matrix6, Point3, Vector3, Vector6};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
@@ -77,6 +78,22 @@ impl Sighting {
     }
 }
 
+/// Working memory of a search, and the tracks that agree with what it found last.
+#[derive(Clone, Debug, Default)]
+pub struct Room {
+    candidates: Vec<Candidate>,
+    samplable: Vec<usize>,
+    inliers: Vec<u32>,
+}
+
+impl Room {
+    /// Indices of the tracks that agree with the motion found last, ascending.
+    #[must_use]
+    pub fn inliers(&self) -> &[u32] {
+        &self.inliers
+    }
+}
+
 /// Finds the consensus of `points`. `guess`, where there is one, is tried before any sample.
 ///
 /// `None` if fewer than three tracks agree on anything.
@@ -87,24 +104,62 @@ pub fn find(
     guess: Option<&Isometry3<f64>>,
     search: &Search,
 ) -> Option<Consensus> {
-    let candidates: Vec<Candidate> = points
-        .iter()
-        .map(|p| Candidate::new(rig, p, guess))
-        .collect();
+    let mut room = Room::default();
+    let prev_from_now = find_in(&mut room, rig, points, guess, search)?;
+    Some(Consensus {
+        prev_from_now,
+        inliers: room.inliers,
+    })
+}
+
+/// The motion that [`find`] finds, in working memory that is used again; who agrees is left there.
+#[must_use]
+pub fn find_in(
+    room: &mut Room,
+    rig: &StereoRig,
+    points: &[Sighting],
+    guess: Option<&Isometry3<f64>>,
+    search: &Search,
+) -> Option<Isometry3<f64>> {
+    let Room {
+        candidates,
+        samplable,
+        inliers,
+    } = room;
+    inliers.clear();
+    candidates.clear();
+    candidates.extend(points.iter().map(|p| Candidate::new(rig, p, guess)));
+    samplable.clear();
+    samplable.extend((0..candidates.len()).filter(|&i| candidates[i].has_depth()));
     let gate = search.gate * search.variance_factor;
+    let motion = best_motion(rig, candidates, samplable, guess, gate, search)?;
+    let now_from_prev = motion.inverse();
+    inliers.extend(
+        (0..candidates.len() as u32)
+            .filter(|&i| candidates[i as usize].squared_sigmas(rig, &now_from_prev) <= gate),
+    );
+    (inliers.len() >= 3).then_some(motion)
+}
+
+/// The best of the guess and of as many samples as it takes, refined on all that agree with it.
+fn best_motion(
+    rig: &StereoRig,
+    candidates: &[Candidate],
+    samplable: &[usize],
+    guess: Option<&Isometry3<f64>>,
+    gate: f64,
+    search: &Search,
+) -> Option<Isometry3<f64>> {
     let mut best = Best::default();
     if let Some(guess) = guess {
-        let refined = refine_on_agreeing(rig, &candidates, guess, gate * SAMPLE_SLACK);
+        let refined = refine_on_agreeing(rig, candidates, guess, gate * SAMPLE_SLACK);
         best.offer(
             rig,
-            &candidates,
+            candidates,
             &refined.unwrap_or(*guess),
             gate * SAMPLE_SLACK,
         );
     }
-    let samplable: Vec<usize> = (0..candidates.len())
-        .filter(|&i| candidates[i].euclidean.is_some())
-        .collect();
     if samplable.len() >= 3 {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(search.seed);
         let mut drawn = 0;
@@ -114,9 +169,9 @@ pub fn find(
                 .min(best.samples_needed(candidates.len()))
         {
             drawn += 1;
-            let sample = draw_three(&mut rng, &samplable);
-            if let Some(motion) = motion_of_sample(rig, &candidates, &sample) {
-                best.offer(rig, &candidates, &motion, gate * SAMPLE_SLACK);
+            let sample = draw_three(&mut rng, samplable);
+            if let Some(motion) = motion_of_sample(rig, candidates, &sample) {
+                best.offer(rig, candidates, &motion, gate * SAMPLE_SLACK);
             }
         }
     }
@@ -127,26 +182,19 @@ pub fn find(
         } else {
             1.0
         };
-        if let Some(refined) = refine_on_agreeing(rig, &candidates, &motion, gate * slack) {
+        if let Some(refined) = refine_on_agreeing(rig, candidates, &motion, gate * slack) {
             motion = refined;
         }
     }
-    let inliers: Vec<u32> = (0..candidates.len() as u32)
-        .filter(|&i| candidates[i as usize].squared_sigmas(rig, &motion) <= gate)
-        .collect();
-    (inliers.len() >= 3).then_some(Consensus {
-        prev_from_now: motion,
-        inliers,
-    })
+    Some(motion)
 }
 
 /// A track prepared for being judged many times.
+#[derive(Clone, Debug)]
 struct Candidate {
-    now_px: Vector4<f64>,
+    now: StereoMeasurement,
     /// (x, y, ρ) of the earlier measurement alone.
     inverse_depth: Vector3<f64>,
-    /// Both triangulated points, where both are in front and near enough to have a depth.
-    euclidean: Option<(Point3<f64>, Point3<f64>)>,
     /// Inverse of the covariance predicted for the residual of the present measurement.
     info: Matrix4<f64>,
     weight: f64,
@@ -159,18 +207,27 @@ impl Candidate {
             let var = p.now.sigma_px.component_mul(&p.now.sigma_px) * 4.0;
             Matrix4::from_diagonal(&var.map(|v| 1.0 / v))
         });
-        let euclidean = super::triangulate(rig, &p.now).and_then(|now| {
-            let y = p.inverse_depth;
-            let far = y.z < 1e-4 || !now.point.z.is_finite();
-            (!far).then(|| (Point3::from(Vector3::new(y.x, y.y, 1.0) / y.z), now.point))
-        });
         Self {
-            now_px: p.now.px,
+            now: p.now,
             inverse_depth: p.inverse_depth,
-            euclidean,
             info,
             weight: p.weight,
         }
+    }
+
+    /// Whether its point is near enough to have a depth.
+    fn has_depth(&self) -> bool {
+        self.inverse_depth.z >= 1e-4
+    }
+
+    /// Both triangulated points. `None` where the present one lies behind, or nowhere.
+    fn euclidean(&self, rig: &StereoRig) -> Option<(Point3<f64>, Point3<f64>)> {
+        let now = super::triangulate(rig, &self.now)?;
+        let y = self.inverse_depth;
+        now.point.z.is_finite().then(|| {
+            let before = Vector3::new(y.x, y.y, 1.0) / y.z;
+            (Point3::from(before), now.point)
+        })
     }
 
     /// Residual now = its own noise plus what the uncertainty of the point carries over.
@@ -180,18 +237,18 @@ impl Candidate {
         now_from_prev: &Isometry3<f64>,
     ) -> Option<Matrix4<f64>> {
         let by_point = sight::linearise(rig, now_from_prev, &p.inverse_depth)?.by_point;
-        let cov = p.now.cov_px2() + by_point * p.cov * by_point.transpose();
+        let carried = product_transposed(&product(&by_point, &p.cov), &by_point);
+        let cov = p.now.cov_px2() + carried;
         Some(cov.cholesky()?.inverse())
     }
 
     /// Squared Mahalanobis distance of the present measurement from what a motion predicts.
-    fn squared_sigmas(&self, rig: &StereoRig, prev_from_now: &Isometry3<f64>) -> f64 {
-        let now_from_prev = prev_from_now.inverse();
-        let Some(seen) = sight::seen_at(rig, &now_from_prev, &self.inverse_depth) else {
+    fn squared_sigmas(&self, rig: &StereoRig, now_from_prev: &Isometry3<f64>) -> f64 {
+        let Some(seen) = sight::seen_at(rig, now_from_prev, &self.inverse_depth) else {
             return f64::INFINITY;
         };
-        let e = self.now_px - seen;
-        e.dot(&(self.info * e))
+        let e = self.now.px - seen;
+        e.dot(&product(&self.info, &e))
     }
 }
 
@@ -212,7 +269,9 @@ fn motion_of_sample(
     candidates: &[Candidate],
     sample: &[usize; 3],
 ) -> Option<Isometry3<f64>> {
-    let coarse = closed_form::align(sample.iter().filter_map(|&i| candidates[i].euclidean))?;
+    let [a, b, c] = sample.map(|i| candidates[i].euclidean(rig));
+    let points = [a?, b?, c?];
+    let coarse = closed_form::align(points.iter().copied())?;
     let mut motion = coarse;
     for _ in 0..SAMPLE_STEPS {
         match step(rig, sample.iter().map(|&i| &candidates[i]), &motion) {
@@ -230,9 +289,10 @@ fn refine_on_agreeing(
     motion: &Isometry3<f64>,
     gate: f64,
 ) -> Option<Isometry3<f64>> {
+    let now_from_prev = motion.inverse();
     let agreeing = candidates
         .iter()
-        .filter(|c| c.squared_sigmas(rig, motion) <= gate);
+        .filter(|c| c.squared_sigmas(rig, &now_from_prev) <= gate);
     if agreeing.clone().count() < 3 {
         return None;
     }
@@ -252,9 +312,9 @@ fn step<'a>(
         let Some(seen) = sight::linearise(rig, &now_from_prev, &c.inverse_depth) else {
             continue;
         };
-        let weighted = seen.by_motion.transpose() * c.info;
-        hessian += weighted * seen.by_motion;
-        gradient += weighted * (c.now_px - seen.px);
+        let weighted = transposed_product(&seen.by_motion, &c.info);
+        hessian += product(&weighted, &seen.by_motion);
+        gradient += product(&weighted, &(c.now.px - seen.px));
     }
     let xi = hessian.cholesky()?.solve(&gradient);
     xi.iter().all(|v| v.is_finite()).then_some(xi)
@@ -276,12 +336,13 @@ impl Best {
         motion: &Isometry3<f64>,
         gate: f64,
     ) {
+        let now_from_prev = motion.inverse();
         let mut score = 0.0;
         let mut agreeing = 0.0;
         let mut ahead: f64 = candidates.iter().map(|c| c.weight).sum();
         for c in candidates {
             ahead -= c.weight;
-            let gain = gate - c.squared_sigmas(rig, motion);
+            let gain = gate - c.squared_sigmas(rig, &now_from_prev);
             if gain > 0.0 {
                 score += c.weight * gain / gate;
                 agreeing += 1.0;

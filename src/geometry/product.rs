@@ -74,6 +74,24 @@ pub(crate) fn transposed_scaled<const R: usize, const C: usize>(
     out
 }
 
+/// Takes `a bᵀ` off `out`.
+#[inline]
+pub(crate) fn subtract_product_transposed<const R: usize, const K: usize, const C: usize>(
+    out: &mut SMatrix<f64, R, C>,
+    a: &SMatrix<f64, R, K>,
+    b: &SMatrix<f64, C, K>,
+) {
+    for c in 0..C {
+        for r in 0..R {
+            let mut sum = 0.0;
+            for k in 0..K {
+                sum += a.data.0[k][r] * b.data.0[k][c];
+            }
+            out.data.0[c][r] -= sum;
+        }
+    }
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -88,6 +106,9 @@ mod tests {
             prop_assert!((product(&a, &b) - a * b).norm() < 1e-14);
             prop_assert!((product_transposed(&a, &b.transpose()) - a * b).norm() < 1e-14);
             prop_assert!((transposed_product(&a.transpose(), &b) - a * b).norm() < 1e-14);
+            let mut left = SMatrix::<f64, 6, 3>::repeat(0.25);
+            subtract_product_transposed(&mut left, &a, &b.transpose());
+            prop_assert!((left - (SMatrix::<f64, 6, 3>::repeat(0.25) - a * b)).norm() < 1e-14);
             prop_assert_eq!(transposed_scaled(&a, &d), a.transpose() * SMatrix::<f64, 6, 6>::from_diagonal(&d));
         }
     }

@@ -15,6 +15,8 @@ pub struct WindowOdometry {
     predicted: Isometry3<f64>,
     known: Vec<Seen>,
     weights: Vec<f64>,
+    inliers: Vec<u32>,
+    agreed: Vec<Seen>,
     new: Vec<Seen>,
 }
 
@@ -32,6 +34,8 @@ impl WindowOdometry {
             predicted: Isometry3::identity(),
             known: Vec::new(),
             weights: Vec::new(),
+            inliers: Vec::new(),
+            agreed: Vec::new(),
             new: Vec::new(),
         }
     }
@@ -66,15 +70,17 @@ impl FrameEstimator for WindowOdometry {
         }
         self.weights.clear();
         self.weights.resize(self.known.len(), 1.0);
-        let consent =
-            self.window
-                .consent(&self.known, &self.weights, &self.predicted, self.pairs)?;
-        let agreed: Vec<Seen> = consent
-            .inliers
-            .iter()
-            .map(|&i| self.known[i as usize])
-            .collect();
-        self.window.add(&consent.newest_from_now, &agreed);
+        let newest_from_now = self.window.consent(
+            &self.known,
+            &self.weights,
+            &self.predicted,
+            self.pairs,
+            &mut self.inliers,
+        )?;
+        self.agreed.clear();
+        let agreed = self.inliers.iter().map(|&i| self.known[i as usize]);
+        self.agreed.extend(agreed);
+        self.window.add(&newest_from_now, &self.agreed);
         let tracked = self.window.adjust()?;
         self.window.settle();
         self.window.promote(&self.new);

@@ -5,7 +5,7 @@
 use super::gallery::{Gallery, Portrait};
 use super::method::Workbench;
 use super::occupancy::Occupancy;
-use crate::estimation::window::{self, Consent, Window};
+use crate::estimation::window::{self, Window};
 use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings, StereoMeasurement};
 use crate::geometry::StereoRig;
 use crate::image::GrayImage;
@@ -38,6 +38,8 @@ pub(super) struct Windowed {
     next_id: u64,
     seen: Vec<window::Seen>,
     weights: Vec<f64>,
+    /// Indices of those of `seen` that agree with the motion.
+    agreed: Vec<u32>,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
     /// Whether a stereo match of the present pair shows a landmark that is known.
@@ -59,6 +61,7 @@ impl Windowed {
             next_id: 0,
             seen: Vec::new(),
             weights: Vec::new(),
+            agreed: Vec::new(),
             matches: Vec::new(),
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
@@ -234,15 +237,15 @@ impl Windowed {
             seen.map(|s| 1.0 / f64::from(self.occupancy.count(&s.measurement.left_px()).max(1))),
         );
         let seed = bench.estimation.seed ^ sequence;
-        let consent = self
-            .window
-            .consent(&self.seen, &self.weights, predicted, seed)?;
-        self.take_note(bench, &consent);
-        Some(consent.newest_from_now)
+        let newest_from_now =
+            self.window
+                .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed)?;
+        self.take_note(bench);
+        Some(newest_from_now)
     }
 
     /// Takes note of who agrees with the motion and who does not; only the former stay in `seen`.
-    fn take_note(&mut self, bench: &Workbench, consent: &Consent) {
+    fn take_note(&mut self, bench: &Workbench) {
         self.is_known.clear();
         self.is_known.resize(bench.now.matches.len(), false);
         for portrait in &mut self.gallery.portraits {
@@ -251,7 +254,7 @@ impl Windowed {
         for &i in &self.matches {
             self.gallery.portraits[bench.tracks[i].before as usize].disagreed = true;
         }
-        for (kept, &i) in consent.inliers.iter().enumerate() {
+        for (kept, &i) in self.agreed.iter().enumerate() {
             let track = bench.tracks[self.matches[i as usize]];
             let portrait = &mut self.gallery.portraits[track.before as usize];
             portrait.disagreed = false;
@@ -261,7 +264,7 @@ impl Windowed {
             self.gallery.recognised(track.before as usize, pair, m);
             self.seen[kept] = self.seen[i as usize];
         }
-        self.seen.truncate(consent.inliers.len());
+        self.seen.truncate(self.agreed.len());
     }
 
     /// Seeks the landmarks that the detector has missed where the motion puts them, and adds what
@@ -326,7 +329,7 @@ impl Windowed {
     }
 
     /// Whether the window should keep the present pair.
-    fn wants_keyframe(&self, bench: &Workbench) -> bool {
+    fn wants_keyframe(&mut self, bench: &Workbench) -> bool {
         let settings = &bench.estimation;
         self.window.survival() < settings.keyframe_survival
             || self.window.parallax_px()

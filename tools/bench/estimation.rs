@@ -1,7 +1,8 @@
 //! How long it takes from matches to a pose with its covariance: `cargo bench --bench estimation`.
 //!
 //! One thread, the features of recordings held in memory. The same run says what matching real
-//! features takes, left–right and over time, with 1,000 keypoints an image.
+//! features takes, left–right and over time, with 1,000 keypoints an image, and what motion and
+//! covariance take when the window follows 500 landmarks.
 
 mod common;
 
@@ -12,6 +13,9 @@ use visod::features::{self, Features};
 use visod::pipeline::{DescribedPair, Method};
 use visod::simulation::thesis_rig;
 
+/// Landmarks to follow so that a pair sees about 500 of them.
+const MANY_LANDMARKS: u32 = 560;
+
 /// Pairs that are stepped through.
 const PAIRS: u64 = 200;
 
@@ -19,19 +23,22 @@ fn main() {
     println!("\n### Matching and estimation of real features, one thread\n");
     println!("| recording | stage | best ms | median ms | p99 ms | tracks | inliers |");
     println!("|---|---|---:|---:|---:|---:|---:|");
-    measure(
-        "simulated, 1280 × 960",
-        &Recording::simulated(thesis_rig(), 12),
-    );
+    let simulated = Recording::simulated(thesis_rig(), 12);
+    measure("simulated, 1280 × 960", &simulated, Settings::default());
+    let many = Settings {
+        max_landmarks: MANY_LANDMARKS,
+        ..Settings::default()
+    };
+    measure("the same, 500 tracks", &simulated, many);
     if let Some(kitti) = Recording::recorded("kitti_straight", 20) {
-        measure("KITTI", &kitti);
+        measure("KITTI", &kitti, Settings::default());
     }
 }
 
-fn measure(name: &str, recording: &Recording) {
+fn measure(name: &str, recording: &Recording, settings: Settings) {
     let described = described(recording);
-    let settings = (Default::default(), Settings::default());
-    let Some(mut method) = Method::new(recording.rig.clone(), settings.0, settings.1) else {
+    let rig = recording.rig.clone();
+    let Some(mut method) = Method::new(rig, Default::default(), settings) else {
         unreachable!("the cameras stand side by side")
     };
     let mut pair = DescribedPair::default();

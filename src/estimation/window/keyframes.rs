@@ -1,10 +1,13 @@
 //! Keyframes: which frames stay in the window, and how the oldest leaves it.
 
-use super::super::sources::{BySources, SOURCES};
+use super::super::sources::BySources;
+use super::memory::{ByUnknowns, Unknowns, UnknownsBySources};
 use super::system::At;
-use super::{Landmark, Seen, Window, row_of};
+use super::warp::WARP;
+use super::{Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Window, row_of};
+use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::se3;
-use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, MatrixXx6, Vector6};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, Vector6};
 
 impl Window {
     /// Makes the newest frame a keyframe, `new` what it sees for the first time. Where the window
@@ -20,16 +23,15 @@ impl Window {
         }
         for s in new {
             let calibrated = self.warp.corrected(&s.measurement);
-            self.landmarks.extend(Landmark::new(
-                &self.rig,
-                s.id,
-                newest,
-                s.measurement,
-                &calibrated,
-            ));
+            let met = Landmark::new(&self.rig, s.id, newest, s.measurement, &calibrated);
+            if let Some(landmark) = met {
+                let sights = self.spare_sights.pop().unwrap_or_else(room_for_sights);
+                self.landmarks
+                    .push(landmark.with_first_sight(sights, s.measurement));
+            }
         }
         // An id may come back after its landmark was given up.
-        self.landmarks.sort_by_key(|l| l.id);
+        self.landmarks.sort_unstable_by_key(|l| l.id);
         let seen = self
             .landmarks
             .iter()
@@ -61,7 +63,7 @@ impl Window {
     /// How far the landmarks that the newest frame and the last keyframe both saw have moved in the
     /// left image: the median, px.
     #[must_use]
-    pub fn parallax_px(&self) -> f64 {
+    pub fn parallax_px(&mut self) -> f64 {
         let (Some(newest), Some(keyframe)) = (
             self.newest_serial(),
             self.frames.iter().rev().find(|f| f.is_keyframe),
@@ -72,11 +74,13 @@ impl Window {
             let seen = l.observations.iter().find(|o| o.serial == serial)?;
             Some(seen.measurement.left_px())
         };
-        let mut moved: Vec<f64> = self
-            .landmarks
-            .iter()
-            .filter_map(|l| Some((left_px(l, newest)? - left_px(l, keyframe.serial)?).norm()))
-            .collect();
+        let moved = &mut self.squares;
+        moved.clear();
+        moved.extend(
+            self.landmarks
+                .iter()
+                .filter_map(|l| Some((left_px(l, newest)? - left_px(l, keyframe.serial)?).norm())),
+        );
         if moved.is_empty() {
             return 0.0;
         }
@@ -107,7 +111,7 @@ impl Window {
             damping: 0.0,
         };
         system.build(&at, leaving);
-        let (mut hessian, mut gradient) = system.assemble();
+        let (mut hessian, mut gradient) = system.assemble(&mut self.memory);
         let mut by_sources =
             self.sensitivity
                 .right_side(&at, &self.errors, &system, &self.landmarks);
@@ -117,15 +121,18 @@ impl Window {
         }
         // From "at the current poses" to "counted from where they are linearised".
         let offsets = self.prior.offsets(&self.warp, &self.frames);
-        gradient += &hessian * offsets;
+        for (column, offset) in hessian.column_iter().zip(&offsets) {
+            gradient.axpy(*offset, &column, 1.0);
+        }
         let m = self.prior.vector.len();
         let mut top = hessian.view_mut((0, 0), (m, m));
         top += &self.prior.information;
         let mut head = gradient.rows_mut(0, m);
         head += &self.prior.vector;
-        let mut head = by_sources.rows_mut(0, m);
-        head += &self.prior.by_sources;
+        by_sources += self.prior.by_sources;
         self.move_datum(&hessian, &gradient, &by_sources);
+        self.memory.recycle(hessian);
+        self.memory.recycle_vector(gradient);
         self.restart_landmarks(oldest, newest);
     }
 
@@ -134,55 +141,62 @@ impl Window {
         &mut self,
         hessian: &DMatrix<f64>,
         gradient: &DVector<f64>,
-        by_sources: &DMatrix<f64>,
+        by_sources: &UnknownsBySources,
     ) {
         let first_linearised = *self.frames[1].datum_from_linearised();
         let all = row_of(self.frames.len());
-        let rest = all - 6;
         // xᵢ = x'ᵢ + Ad(frame i ← frame 1) x₁.
-        let moved: Vec<Matrix6<f64>> = self.frames[2..]
-            .iter()
-            .map(|f| se3::adjoint(&(f.datum_from_linearised().inverse() * first_linearised)))
-            .collect();
-        let mut along = MatrixXx6::zeros(all);
+        let mut moved = [Matrix6::zeros(); MAX_FRAMES];
+        let mut along = OfPose::zeros();
         along
             .fixed_rows_mut::<6>(row_of(1))
             .copy_from(&Matrix6::identity());
-        for (i, block) in moved.iter().enumerate() {
-            along.fixed_rows_mut::<6>(row_of(i + 2)).copy_from(block);
+        for (i, f) in self.frames[2..].iter().enumerate() {
+            moved[i] = se3::adjoint(&(f.datum_from_linearised().inverse() * first_linearised));
+            along
+                .fixed_rows_mut::<6>(row_of(i + 2))
+                .copy_from(&moved[i]);
         }
-        let by_first = hessian * &along;
-        let first: Matrix6<f64> = along.transpose() * &by_first;
-        let first_gradient: Vector6<f64> = along.transpose() * gradient;
+        let moved = &moved[..self.frames.len() - 2];
+        let by_first = hessian_times(hessian, &along);
+        let first: Matrix6<f64> = transposed_product(&along, &by_first);
+        let mut full_gradient = Unknowns::zeros();
+        full_gradient.rows_mut(0, all).copy_from(gradient);
+        let first_gradient: Vector6<f64> = transposed_product(&along, &full_gradient);
         // Without anything that holds frame 1 nothing can be handed on; the datum's own
         // uncertainty then has to grow beyond bounds, which the ridge expresses.
         let cov_first = invert_or_ridge(&se3::symmetric(&first));
         let mean = cov_first * first_gradient;
-        let first_by_sources: BySources = along
-            .tr_mul(by_sources)
-            .fixed_view::<6, SOURCES>(0, 0)
-            .into_owned();
-        let mean_by_sources: BySources = cov_first * first_by_sources;
-        let cross = by_first.remove_fixed_rows::<6>(row_of(1));
-        let by_rest: Matrix6xX<f64> = -(cov_first * cross.transpose());
-        let hessian = hessian
-            .clone()
-            .remove_fixed_rows::<6>(row_of(1))
-            .remove_fixed_columns::<6>(row_of(1));
-        let information = hessian + &cross * &by_rest;
+        let first_by_sources: BySources = transposed_product(&along, by_sources);
+        let mean_by_sources: BySources = product(&cov_first, &first_by_sources);
+        let cross = without_first(&by_first);
+        let by_rest: ByUnknowns = -product_transposed(&cov_first, &cross);
         // The newest frame, last in the window, took no part.
-        let known = rest - 6;
-        let symmetric = (&information + information.transpose()) * 0.5;
-        self.prior.information = symmetric.view((0, 0), (known, known)).into_owned();
-        let gradient = gradient.clone().remove_fixed_rows::<6>(row_of(1)) - &cross * mean;
-        self.prior.vector = gradient.rows(0, known).into_owned();
-        let of_rest = by_sources.clone().remove_fixed_rows::<6>(row_of(1));
-        let of_first: DMatrix<f64> =
-            &cross * DMatrix::from_column_slice(6, SOURCES, mean_by_sources.as_slice());
-        self.prior.by_sources = (of_rest - of_first).rows(0, known).into_owned();
+        let known = all - 12;
+        let mut information = self.memory.square(known);
+        for j in 0..known {
+            for i in 0..known {
+                let through_first: f64 = (0..6).map(|k| cross[(i, k)] * by_rest[(k, j)]).sum();
+                information[(i, j)] = hessian[(old_row(i), old_row(j))] + through_first;
+            }
+        }
+        symmetrise(&mut information);
+        self.memory
+            .recycle(std::mem::replace(&mut self.prior.information, information));
+        let mut vector = self.memory.vector(known);
+        let mut kept_by_sources = UnknownsBySources::zeros();
+        for i in 0..known {
+            let cross = cross.row(i);
+            vector[i] = gradient[old_row(i)] - (cross * mean)[0];
+            let row = by_sources.row(old_row(i)) - cross * mean_by_sources;
+            kept_by_sources.set_row(i, &row);
+        }
+        self.memory
+            .recycle_vector(std::mem::replace(&mut self.prior.vector, vector));
+        self.prior.by_sources = kept_by_sources;
         self.datum.advance(
             &self.frames,
-            &moved,
+            moved,
             &mean,
             &mean_by_sources,
             &by_rest,
@@ -204,23 +218,75 @@ impl Window {
 
     fn restart_landmarks(&mut self, oldest: u64, newest: u64) {
         let (rig, warp) = (&self.rig, &self.warp);
+        let spare = &mut self.spare_sights;
         self.landmarks.retain_mut(|landmark| {
             if landmark.anchor != oldest {
                 return true;
             }
-            let Some(last) = landmark.observations.last().filter(|o| o.serial == newest) else {
-                return false;
-            };
-            let calibrated = warp.corrected(&last.measurement);
-            match Landmark::new(rig, landmark.id, newest, last.measurement, &calibrated) {
-                Some(anew) => {
-                    *landmark = anew;
+            let sights = std::mem::take(&mut landmark.observations);
+            let last = sights.last().filter(|o| o.serial == newest).copied();
+            let anew = last.and_then(|last| {
+                let calibrated = warp.corrected(&last.measurement);
+                Landmark::new(rig, landmark.id, newest, last.measurement, &calibrated)
+            });
+            match (anew, last) {
+                (Some(anew), Some(last)) => {
+                    *landmark = anew.with_first_sight(sights, last.measurement);
                     true
                 }
-                None => false,
+                _ => {
+                    spare.push(sights);
+                    false
+                }
             }
         });
     }
+}
+
+/// A row for each unknown, a column for each of one pose.
+type OfPose = SMatrix<f64, MAX_UNKNOWNS, 6>;
+
+/// `hessian · along`.
+fn hessian_times(hessian: &DMatrix<f64>, along: &OfPose) -> OfPose {
+    let n = hessian.nrows();
+    let mut out = OfPose::zeros();
+    for (c, mut column) in out.column_iter_mut().enumerate() {
+        for k in 0..n {
+            column
+                .rows_mut(0, n)
+                .axpy(along[(k, c)], &hessian.column(k), 1.0);
+        }
+    }
+    out
+}
+
+/// Where an unknown stood before frame 1 became the datum.
+fn old_row(row: usize) -> usize {
+    if row < WARP { row } else { row + 6 }
+}
+
+/// The same without the rows of frame 1.
+fn without_first(of_pose: &OfPose) -> OfPose {
+    let mut out = OfPose::zeros();
+    for i in 0..MAX_UNKNOWNS - 6 {
+        out.set_row(i, &of_pose.row(old_row(i)));
+    }
+    out
+}
+
+fn symmetrise(matrix: &mut DMatrix<f64>) {
+    for j in 0..matrix.ncols() {
+        for i in 0..j {
+            let mean = 0.5 * (matrix[(i, j)] + matrix[(j, i)]);
+            matrix[(i, j)] = mean;
+            matrix[(j, i)] = mean;
+        }
+    }
+}
+
+/// A list of sights that never has to grow.
+fn room_for_sights() -> Vec<Observation> {
+    Vec::with_capacity(MAX_FRAMES)
 }
 
 /// σ of a pose that nothing holds: m or rad.

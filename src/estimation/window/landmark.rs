@@ -37,7 +37,7 @@ impl Landmark {
     /// A landmark that its anchor alone has seen; `calibrated` is the measurement as a rig as
     /// calibrated would have made it. `None` where the sights do not meet.
     #[must_use]
-    pub fn new(
+    pub(super) fn new(
         rig: &StereoRig,
         id: LandmarkId,
         anchor: u64,
@@ -55,12 +55,24 @@ impl Landmark {
             anchor,
             inverse_depth,
             cov,
-            observations: vec![Observation {
-                serial: anchor,
-                measurement,
-            }],
+            observations: Vec::new(),
             wrong: 0,
         })
+    }
+
+    /// The landmark with what its anchor saw as the only sight in `sights`, whose memory is used again.
+    pub(super) fn with_first_sight(
+        mut self,
+        mut sights: Vec<Observation>,
+        measurement: StereoMeasurement,
+    ) -> Self {
+        sights.clear();
+        sights.push(Observation {
+            serial: self.anchor,
+            measurement,
+        });
+        self.observations = sights;
+        self
     }
 
     /// Takes note of one more sight.

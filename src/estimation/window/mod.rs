@@ -20,6 +20,7 @@
 mod datum;
 mod keyframes;
 mod landmark;
+mod memory;
 mod planar;
 mod prior;
 mod sensitivity;
@@ -30,17 +31,18 @@ mod tests;
 mod warp;
 
 pub use landmark::{Landmark, LandmarkId, Observation};
-pub use solve::Consent;
 
 use super::closed_form::MotionEstimate;
 use super::sources::{BySources, Exposure, RigErrors, SOURCES};
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
 use datum::Datum;
+use memory::Memory;
 use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4};
 use planar::Ground;
 use prior::Prior;
 use sensitivity::Sensitivity;
+use solve::{Sightings, State};
 use system::System;
 pub(super) use warp::WARP;
 use warp::Warp;
@@ -52,9 +54,11 @@ const fn row_of(i: usize) -> usize {
 
 /// Frames in the window at most: keyframes, the last frame and the current one.
 const MAX_FRAMES: usize = 16;
+/// Unknowns of the warp and of poses at most.
+const MAX_UNKNOWNS: usize = row_of(MAX_FRAMES);
 
 /// One pair of images in the window.
-#[derive(Clone, Debug)]
+#[derive(Clone, Copy, Debug)]
 struct Frame {
     /// Counts all frames that ever were.
     serial: u64,
@@ -93,6 +97,11 @@ pub struct Window {
     next_serial: u64,
     variance: VarianceFactor,
     system: System,
+    memory: Memory,
+    kept: State,
+    sightings: Sightings,
+    /// Lists of sights that belong to no landmark at present.
+    spare_sights: Vec<Vec<Observation>>,
     squares: Vec<f64>,
 }
 
@@ -124,9 +133,7 @@ impl Window {
         let warp = Warp::new(&rig);
         let cov_warp = warp::prior_covariance(&rig, &settings);
         let prior = Prior::new(&warp, &cov_warp);
-        let warp_by_sources = (cov_warp * &prior.by_sources)
-            .fixed_view::<WARP, SOURCES>(0, 0)
-            .into_owned();
+        let warp_by_sources = cov_warp * prior.by_sources.fixed_rows::<WARP>(0);
         Self {
             prior,
             errors: RigErrors::of(&rig, &settings),
@@ -150,6 +157,10 @@ impl Window {
                 frames: 0,
             },
             system: System::default(),
+            memory: Memory::default(),
+            kept: State::default(),
+            sightings: Sightings::default(),
+            spare_sights: Vec::new(),
             squares: Vec::new(),
         }
     }

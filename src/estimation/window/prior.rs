@@ -5,6 +5,7 @@
 //! where the prior was linearised: cost `½ xᵀ H x − bᵀ x`.
 
 use super::super::sources::{SOURCES, WARP_COLUMNS};
+use super::memory::{Unknowns, UnknownsBySources};
 use super::warp::{WARP, Warp};
 use super::{Frame, row_of};
 use crate::geometry::se3;
@@ -16,7 +17,7 @@ pub(super) struct Prior {
     pub(super) information: DMatrix<f64>,
     pub(super) vector: DVector<f64>,
     /// By how much the vector moves with each source of error.
-    pub(super) by_sources: DMatrix<f64>,
+    pub(super) by_sources: UnknownsBySources,
 }
 
 impl Prior {
@@ -28,7 +29,7 @@ impl Prior {
         let mut prior = Self {
             information: DMatrix::zeros(WARP, WARP),
             vector: DVector::zeros(WARP),
-            by_sources: DMatrix::zeros(WARP, SOURCES),
+            by_sources: UnknownsBySources::zeros(),
         };
         prior.information.copy_from(&information);
         prior.vector.copy_from(&(information * warp.coefficients));
@@ -36,7 +37,7 @@ impl Prior {
             let by_own = information * factor.l();
             prior
                 .by_sources
-                .view_mut((0, WARP_COLUMNS), (WARP, WARP))
+                .fixed_view_mut::<WARP, WARP>(0, WARP_COLUMNS)
                 .copy_from(&by_own);
         }
         prior
@@ -49,15 +50,19 @@ impl Prior {
         warp_by_sources: &SMatrix<f64, WARP, SOURCES>,
     ) -> Self {
         let mut prior = Self::new(warp, cov);
-        let by_sources = &prior.information * warp_by_sources;
-        prior.by_sources.copy_from(&by_sources);
+        let information = prior.information.fixed_view::<WARP, WARP>(0, 0);
+        prior.by_sources.fill(0.0);
+        prior
+            .by_sources
+            .fixed_rows_mut::<WARP>(0)
+            .copy_from(&(information * warp_by_sources));
         prior
     }
 
     /// The warp, and how far the poses of frames 1 … stand from where they were
     /// linearised; zero for those that the prior does not know.
-    pub(super) fn offsets(&self, warp: &Warp, frames: &[Frame]) -> DVector<f64> {
-        let mut x = DVector::zeros(row_of(frames.len().max(1)));
+    pub(super) fn offsets(&self, warp: &Warp, frames: &[Frame]) -> Unknowns {
+        let mut x = Unknowns::zeros();
         x.fixed_rows_mut::<WARP>(0).copy_from(&warp.coefficients);
         for (i, frame) in frames.iter().enumerate().skip(1) {
             if let Some(linearised) = &frame.linearised {
@@ -78,12 +83,16 @@ impl Prior {
         gradient: &mut DVector<f64>,
     ) -> f64 {
         let m = self.vector.len();
-        let x = self.offsets(warp, frames).rows(0, m).into_owned();
-        let by_x = &self.information * &x;
+        let x = self.offsets(warp, frames);
+        let mut by_x = Unknowns::zeros();
+        for (j, column) in self.information.column_iter().enumerate() {
+            by_x.rows_mut(0, m).axpy(x[j], &column, 1.0);
+        }
         let mut top = hessian.view_mut((0, 0), (m, m));
         top += &self.information;
         let mut head = gradient.rows_mut(0, m);
-        head += &self.vector - &by_x;
-        0.5 * x.dot(&by_x) - self.vector.dot(&x)
+        head += &self.vector;
+        head -= by_x.rows(0, m);
+        0.5 * x.dot(&by_x) - self.vector.dot(&x.rows(0, m))
     }
 }

@@ -7,13 +7,14 @@
 
 use super::super::calibration::sight_by_skew;
 use super::super::sight;
-use super::super::sources::{MODE_COLUMNS, MODES, RigErrors, SKEW_COLUMN, SOURCES};
+use super::super::sources::{MODE_COLUMNS, MODES, RigErrors, SKEW_COLUMN};
 use super::landmark::Landmark;
+use super::memory::UnknownsBySources;
 use super::row_of;
 use super::system::{At, System, weigh};
 use super::warp::WARP;
 use crate::geometry::product::{product, transposed_product};
-use nalgebra::{DMatrix, SMatrix};
+use nalgebra::SMatrix;
 
 /// Columns that displace sights: the modes and the skew.
 const MOVING: usize = MODES + 1;
@@ -36,9 +37,9 @@ impl Sensitivity {
         errors: &RigErrors,
         system: &System,
         landmarks: &[Landmark],
-    ) -> DMatrix<f64> {
+    ) -> UnknownsBySources {
         let n = at.frames.len();
-        let mut right = DMatrix::zeros(row_of(n.max(1)), SOURCES);
+        let mut right = UnknownsBySources::zeros();
         let has_skew = at.frames.iter().any(|f| f.exposure.sigma_skew_s > 0.0);
         if !errors.has_modes() && !has_skew {
             return right;
@@ -85,7 +86,7 @@ impl Sensitivity {
                 );
                 let mut weighted = displaced;
                 for i in 0..4 {
-                    weighted.row_mut(i).scale_mut(info[(i, i)]);
+                    weighted.row_mut(i).scale_mut(info[i]);
                 }
                 by_point += transposed_product(&seen.by_point, &weighted);
                 let by_warp = at.warp.derivative(&observation.measurement);

@@ -1,30 +1,33 @@
 //! One frame more: its measurements in, the adjusted window and what it says of the frame out.
 
 use super::super::closed_form::MotionEstimate;
-use super::super::consensus::{self, Search, Sighting};
+use super::super::consensus::{self, Room, Search, Sighting};
 use super::super::sight;
 use super::super::sources::{BySources, Exposure, SOURCES};
 use super::datum::Datum;
+use super::memory::{ByUnknowns, Memory, UnknownsBySources, carried};
 use super::prior::Prior;
 use super::system::{At, System};
-use super::warp::{WARP, Warp};
+use super::warp::WARP;
 use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
+use crate::geometry::product::product;
 use crate::geometry::se3;
-use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, Matrix6xX, Vector3, Vector6};
+use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Isometry3, Matrix6, SVector, Vector3, Vector6};
 
-/// A frame's motion that many of its sights agree on, before adjustment.
-#[derive(Clone, Debug)]
-pub struct Consent {
-    /// Maps a point of the left camera now into that of the window's newest frame.
-    pub newest_from_now: Isometry3<f64>,
-    /// Indices of the sights that agree, ascending.
-    pub inliers: Vec<u32>,
+/// Sights prepared for the consensus, and its own working memory.
+#[derive(Clone, Debug, Default)]
+pub(super) struct Sightings {
+    /// Which of the sights given each is.
+    indices: Vec<u32>,
+    prepared: Vec<Sighting>,
+    room: Room,
 }
 
 /// What a step that proves to be bad is taken back to.
-struct State {
+#[derive(Clone, Debug, Default)]
+pub(super) struct State {
     cost: f64,
-    warp: Warp,
+    warp: SVector<f64, WARP>,
     frames: Vec<Frame>,
     points: Vec<Vector3<f64>>,
 }
@@ -56,7 +59,8 @@ impl Window {
         self.datum = Datum::new(odom_from_first, cov_right, by_sources);
         self.prior = Prior::learnt(&self.warp, &self.cov_warp, &self.warp_by_sources);
         self.frames.clear();
-        self.landmarks.clear();
+        let landmarks = self.landmarks.drain(..);
+        self.spare_sights.extend(landmarks.map(|l| l.observations));
         self.frames.push(Frame {
             serial,
             datum_from_frame: Isometry3::identity(),
@@ -67,49 +71,59 @@ impl Window {
         });
     }
 
-    /// The motion that most of `seen`, sights of known landmarks, agree on, each with its weight;
-    /// `guess` is where to look first. Changes nothing. `None` if fewer agree than the settings ask for.
+    /// The motion (maps a point of the left camera now into that of the newest frame) that most of
+    /// `seen`, sights of known landmarks, agree on, each with its weight; `guess` is where to look
+    /// first. The indices of those that agree are left in `agreed`, ascending. Leaves the window as it
+    /// is. `None` if fewer agree than the settings ask for.
     #[must_use]
     pub fn consent(
-        &self,
+        &mut self,
         seen: &[Seen],
         weights: &[f64],
         guess: &Isometry3<f64>,
         seed: u64,
-    ) -> Option<Consent> {
-        let newest = self.frames.last()?;
-        let scale = 1.0 / self.variance.smoothed;
-        let mut indices = Vec::with_capacity(seen.len());
-        let mut sightings = Vec::with_capacity(seen.len());
-        for ((i, s), &weight) in (0..).zip(seen).zip(weights) {
-            let sighting = self.landmark(s.id).and_then(|landmark| {
-                let anchor = &self.frames[self.frame_index(landmark.anchor)?];
-                let newest_from_anchor =
-                    newest.datum_from_frame.inverse() * anchor.datum_from_frame;
-                let (inverse_depth, cov) = landmark.seen_from(&newest_from_anchor)?;
-                Some(Sighting {
-                    inverse_depth,
-                    cov: cov * scale,
-                    now: self.warp.corrected(&s.measurement),
-                    weight,
-                })
-            });
-            if let Some(sighting) = sighting {
-                indices.push(i);
-                sightings.push(sighting);
-            }
-        }
+        agreed: &mut Vec<u32>,
+    ) -> Option<Isometry3<f64>> {
+        let mut sightings = std::mem::take(&mut self.sightings);
+        self.prepare(seen, weights, &mut sightings);
         let search = Search {
             max_samples: self.settings.max_samples,
             gate: self.settings.gate_sigma2,
             variance_factor: self.variance.smoothed,
             seed,
         };
-        let found = consensus::find(&self.rig, &sightings, Some(guess), &search)?;
-        (found.inliers.len() >= self.settings.min_inliers as usize).then(|| Consent {
-            newest_from_now: found.prev_from_now,
-            inliers: found.inliers.iter().map(|&i| indices[i as usize]).collect(),
-        })
+        let Sightings {
+            indices,
+            prepared,
+            room,
+        } = &mut sightings;
+        let found = consensus::find_in(room, &self.rig, prepared, Some(guess), &search);
+        agreed.clear();
+        agreed.extend(room.inliers().iter().map(|&i| indices[i as usize]));
+        self.sightings = sightings;
+        found.filter(|_| agreed.len() >= self.settings.min_inliers as usize)
+    }
+
+    /// The sights whose landmark lies in front of the newest frame, for the consensus.
+    fn prepare(&self, seen: &[Seen], weights: &[f64], sightings: &mut Sightings) {
+        sightings.indices.clear();
+        sightings.prepared.clear();
+        let scale = 1.0 / self.variance.smoothed;
+        for ((i, s), &weight) in (0..).zip(seen).zip(weights) {
+            let moved = self.landmark(s.id).and_then(|landmark| {
+                let newest_from_anchor = self.newest_from_anchor(landmark)?;
+                landmark.seen_from(&newest_from_anchor)
+            });
+            if let Some((inverse_depth, cov)) = moved {
+                sightings.indices.push(i);
+                sightings.prepared.push(Sighting {
+                    inverse_depth,
+                    cov: cov * scale,
+                    now: self.warp.corrected(&s.measurement),
+                    weight,
+                });
+            }
+        }
     }
 
     /// Adds the current frame, which stands at `newest_from_now`, with its sights of landmarks.
@@ -185,32 +199,57 @@ impl Window {
             if self.judge_newest() == 0 {
                 break;
             }
+            self.memory.recycle(joint);
             joint = self.solve()?;
         }
+        let tracked = self.conclude(&joint);
+        self.memory.recycle(joint);
+        tracked
+    }
+
+    /// What the adjusted window says of its newest frame; what it says of the rig is kept.
+    fn conclude(&mut self, joint: &Joint) -> Option<Tracked> {
         let inliers = self.count_newest();
         if inliers < self.settings.min_inliers {
             return None;
         }
         // With the weights that the joint covariance has.
-        let by_sources = self.by_sources(&joint);
+        let by_sources = self.by_sources(joint);
         let variance_factor = self.measure_variance()?;
         self.variance.take(variance_factor);
         self.cov_warp = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
         self.warp_by_sources = by_sources.fixed_view::<WARP, SOURCES>(0, 0).into_owned();
-        Some(self.tracked(&joint, &by_sources, variance_factor, inliers))
+        Some(self.tracked(joint, &by_sources, variance_factor, inliers))
     }
 
-    /// Levenberg–Marquardt over warp, poses and landmarks; the joint covariance of warp and poses at
-    /// the optimum.
+    /// Adjusts warp, poses and landmarks; the joint covariance of warp and poses at the optimum.
     fn solve(&mut self) -> Option<Joint> {
         let mut system = std::mem::take(&mut self.system);
+        let mut memory = std::mem::take(&mut self.memory);
+        let joint = self.iterate(&mut system, &mut memory).map(|factor| {
+            let mut joint = memory.square(factor.l_dirty().nrows());
+            joint.fill_with_identity();
+            factor.solve_mut(&mut joint);
+            memory.recycle(factor.unpack_dirty());
+            joint
+        });
+        self.system = system;
+        self.memory = memory;
+        joint
+    }
+
+    /// Levenberg–Marquardt; the last equations' information, factored.
+    fn iterate(&mut self, system: &mut System, memory: &mut Memory) -> Option<Cholesky<f64, Dyn>> {
         let mut damping = 0.0;
-        let mut kept: Option<State> = None;
-        let mut joint = None;
+        let mut has_kept = false;
+        let mut factor: Option<Cholesky<f64, Dyn>> = None;
         for _ in 0..MAX_ITERATIONS {
-            let (mut hessian, gradient, cost) = self.equations(&mut system, damping);
-            if let Some(before) = kept.take_if(|k| cost > k.cost + 1e-9 * k.cost.abs()) {
-                self.restore(before);
+            let (mut hessian, gradient, cost) = self.equations(system, memory, damping);
+            if has_kept && cost > self.kept.cost + 1e-9 * self.kept.cost.abs() {
+                has_kept = false;
+                memory.recycle(hessian);
+                memory.recycle_vector(gradient);
+                self.restore();
                 damping = if damping == 0.0 { 1e-4 } else { damping * 10.0 };
                 if damping > MAX_DAMPING {
                     break;
@@ -221,29 +260,43 @@ impl Window {
                 hessian[(i, i)] *= 1.0 + damping;
             }
             let Some(cholesky) = hessian.cholesky() else {
+                memory.recycle_vector(gradient);
                 break;
             };
-            let step = cholesky.solve(&gradient);
+            let mut step = memory.vector(gradient.len());
+            step.copy_from(&gradient);
+            cholesky.solve_mut(&mut step);
+            let gain = 0.5 * step.dot(&gradient);
+            memory.recycle_vector(gradient);
             if step.iter().any(|v| !v.is_finite()) {
+                memory.recycle(cholesky.unpack_dirty());
+                memory.recycle_vector(step);
                 break;
             }
-            joint = Some(cholesky.inverse());
-            if damping == 0.0 && 0.5 * step.dot(&gradient) < MIN_GAIN {
+            if let Some(before) = factor.replace(cholesky) {
+                memory.recycle(before.unpack_dirty());
+            }
+            let is_done = damping == 0.0 && gain < MIN_GAIN;
+            if is_done {
                 // The landmarks' own covariances are still due.
-                system.move_landmarks(&DVector::zeros(step.len()), &mut self.landmarks);
+                step.fill(0.0);
+            } else {
+                self.keep(cost);
+                has_kept = true;
+                self.move_frames(&step);
+                damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
+            }
+            system.move_landmarks(&step, &mut self.landmarks);
+            memory.recycle_vector(step);
+            if is_done {
                 break;
             }
-            kept = Some(self.state(cost));
-            self.move_frames(&step);
-            system.move_landmarks(&step, &mut self.landmarks);
-            damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
         }
-        self.system = system;
-        joint
+        factor
     }
 
     /// The derivative of warp and poses by each source of error.
-    fn by_sources(&mut self, joint: &Joint) -> DMatrix<f64> {
+    fn by_sources(&mut self, joint: &Joint) -> UnknownsBySources {
         let at = At {
             rig: &self.rig,
             warp: &self.warp,
@@ -255,13 +308,28 @@ impl Window {
         let mut right =
             self.sensitivity
                 .right_side(&at, &self.errors, &self.system, &self.landmarks);
-        let mut head = right.rows_mut(0, self.prior.vector.len());
-        head += &self.prior.by_sources;
-        joint * right
+        right += self.prior.by_sources;
+        let n = joint.nrows();
+        let mut by_sources = UnknownsBySources::zeros();
+        for (c, mut column) in by_sources.column_iter_mut().enumerate() {
+            for k in 0..n {
+                if right[(k, c)] != 0.0 {
+                    column
+                        .rows_mut(0, n)
+                        .axpy(right[(k, c)], &joint.column(k), 1.0);
+                }
+            }
+        }
+        by_sources
     }
 
     /// The equations at the present state, the prior included, and the cost.
-    fn equations(&self, system: &mut System, damping: f64) -> (DMatrix<f64>, DVector<f64>, f64) {
+    fn equations(
+        &self,
+        system: &mut System,
+        memory: &mut Memory,
+        damping: f64,
+    ) -> (DMatrix<f64>, DVector<f64>, f64) {
         let at = At {
             rig: &self.rig,
             warp: &self.warp,
@@ -271,7 +339,7 @@ impl Window {
             damping,
         };
         let cost = system.build(&at, self.landmarks.iter().enumerate());
-        let (mut hessian, mut gradient) = system.assemble();
+        let (mut hessian, mut gradient) = system.assemble(memory);
         let of_prior = self
             .prior
             .add_to(&self.warp, &self.frames, &mut hessian, &mut gradient);
@@ -281,19 +349,20 @@ impl Window {
         (hessian, gradient, cost + of_prior + of_ground)
     }
 
-    fn state(&self, cost: f64) -> State {
-        State {
-            cost,
-            warp: self.warp.clone(),
-            frames: self.frames.clone(),
-            points: self.landmarks.iter().map(|l| l.inverse_depth).collect(),
-        }
+    /// Notes the present state, to come back to.
+    fn keep(&mut self, cost: f64) {
+        self.kept.cost = cost;
+        self.kept.warp = self.warp.coefficients;
+        self.kept.frames.clone_from(&self.frames);
+        self.kept.points.clear();
+        let points = self.landmarks.iter().map(|l| l.inverse_depth);
+        self.kept.points.extend(points);
     }
 
-    fn restore(&mut self, state: State) {
-        self.warp = state.warp;
-        self.frames = state.frames;
-        for (landmark, point) in self.landmarks.iter_mut().zip(&state.points) {
+    fn restore(&mut self) {
+        self.warp.coefficients = self.kept.warp;
+        self.frames.clone_from(&self.kept.frames);
+        for (landmark, point) in self.landmarks.iter_mut().zip(&self.kept.points) {
             landmark.inverse_depth = *point;
         }
     }
@@ -396,7 +465,7 @@ impl Window {
     fn tracked(
         &self,
         joint: &Joint,
-        by_sources: &DMatrix<f64>,
+        by_sources: &UnknownsBySources,
         variance_factor: f64,
         inliers: u32,
     ) -> Tracked {
@@ -405,7 +474,7 @@ impl Window {
         let before = self.frames[n - 2].datum_from_frame;
         let prev_from_now = before.inverse() * newest;
         // x_now − Ad(now_from_prev) x_prev; the datum has no error of its own here.
-        let mut by_window = Matrix6xX::zeros(row_of(n));
+        let mut by_window = ByUnknowns::zeros();
         by_window
             .fixed_columns_mut::<6>(row_of(n - 1))
             .copy_from(&Matrix6::identity());
@@ -414,14 +483,14 @@ impl Window {
                 .fixed_columns_mut::<6>(row_of(n - 2))
                 .copy_from(&-se3::adjoint(&prev_from_now.inverse()));
         }
-        let cov: Matrix6<f64> = &by_window * joint * by_window.transpose();
+        let cov = carried(&by_window, joint);
         Tracked {
             odom_from_now: self.odom_from_newest(),
             cov_pose_right: self.pose_covariance(&newest, joint),
-            pose_by_sources: self.datum.sensitivity_of(&newest, by_sources),
-            motion_by_sources: (&by_window * by_sources)
-                .fixed_view::<6, SOURCES>(0, 0)
-                .into_owned(),
+            pose_by_sources: self
+                .datum
+                .sensitivity_of(&newest, joint.nrows(), by_sources),
+            motion_by_sources: product(&by_window, by_sources),
             motion: MotionEstimate {
                 prev_from_now,
                 cov_right: se3::symmetric(&cov),

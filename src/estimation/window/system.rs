@@ -6,11 +6,15 @@
 use super::super::bundle::{huber_loss, huber_weight};
 use super::super::sight;
 use super::landmark::Landmark;
+use super::memory::Memory;
 use super::warp::{WARP, Warp};
 use super::{Frame, row_of};
+use crate::geometry::product::{
+    product, subtract_product_transposed, transposed_product, transposed_scaled,
+};
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{
-    DMatrix, DVector, Isometry3, Matrix3, Matrix4, Matrix6, SMatrix, SVector, Vector3, Vector4,
+    DMatrix, DVector, Isometry3, Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3, Vector4,
     Vector6,
 };
 
@@ -50,6 +54,7 @@ struct Sightline {
     /// The same where the Jacobians are taken, if elsewhere.
     linearised: Option<Isometry3<f64>>,
     adjoint: Matrix6<f64>,
+    adjoint_transposed: Matrix6<f64>,
     information: Matrix6<f64>,
     by_warp: SMatrix<f64, 6, WARP>,
     gradient: Vector6<f64>,
@@ -125,8 +130,10 @@ impl System {
                     (anchor.linearised.is_some() || frame.linearised.is_some()).then(|| {
                         frame.datum_from_linearised().inverse() * anchor.datum_from_linearised()
                     });
+                let adjoint = se3::adjoint(linearised.as_ref().unwrap_or(&current));
                 self.sightlines.push(Sightline {
-                    adjoint: se3::adjoint(linearised.as_ref().unwrap_or(&current)),
+                    adjoint,
+                    adjoint_transposed: adjoint.transpose(),
                     frame_from_anchor: current,
                     linearised,
                     information: Matrix6::zeros(),
@@ -189,25 +196,26 @@ impl System {
                 at.variance_factor,
             );
             cost += loss;
-            let weighted = seen.by_point.transpose() * info;
-            point_point += weighted * seen.by_point;
-            point_gradient += weighted * residual;
+            let weighted = transposed_scaled(&seen.by_point, &info);
+            point_point += product(&weighted, &seen.by_point);
+            point_gradient += product(&weighted, &residual);
             let by_warp = warp.derivative(&observation.measurement);
-            let right = info.fixed_view::<2, 2>(2, 2);
-            let warp_weighted = by_warp.transpose() * right;
-            warp_warp += warp_weighted * by_warp;
-            warp_point += warp_weighted * seen.by_point.fixed_rows::<2>(2);
-            warp_gradient += warp_weighted * residual.fixed_rows::<2>(2);
+            let warp_weighted = transposed_scaled(&by_warp, &Vector2::new(info[2], info[3]));
+            warp_warp += product(&warp_weighted, &by_warp);
+            let right_by_point = seen.by_point.fixed_rows::<2>(2).into_owned();
+            warp_point += product(&warp_weighted, &right_by_point);
+            warp_gradient += product(&warp_weighted, &Vector2::new(residual[2], residual[3]));
             if frame == anchor {
                 continue;
             }
-            let weighted = seen.by_motion.transpose() * info;
-            line.information += weighted * seen.by_motion;
-            line.by_warp += weighted.fixed_columns::<2>(2) * by_warp;
-            line.gradient += weighted * residual;
+            let weighted = transposed_scaled(&seen.by_motion, &info);
+            line.information += product(&weighted, &seen.by_motion);
+            let of_right = weighted.fixed_columns::<2>(2).into_owned();
+            line.by_warp += product(&of_right, &by_warp);
+            line.gradient += product(&weighted, &residual);
             line.is_used = true;
-            let by_point = weighted * seen.by_point;
-            anchor_by_point -= line.adjoint.transpose() * by_point;
+            let by_point = product(&weighted, &seen.by_point);
+            anchor_by_point -= product(&line.adjoint_transposed, &by_point);
             self.crosses.push(Cross { frame, by_point });
         }
         if sights < 2 {
@@ -225,19 +233,24 @@ impl System {
         let crosses = first_cross..self.crosses.len();
         for i in crosses.clone() {
             let a = &self.crosses[i];
-            let gain = a.by_point * cov;
-            self.gradients[a.frame] -= gain * point_gradient;
-            self.by_warp[a.frame] -= gain * warp_point.transpose();
+            // The datum has no unknowns.
+            if a.frame == 0 {
+                continue;
+            }
+            let gain = product(&a.by_point, &cov);
+            self.gradients[a.frame] -= product(&gain, &point_gradient);
+            subtract_product_transposed(&mut self.by_warp[a.frame], &gain, &warp_point);
+            let row = &mut self.blocks[a.frame * self.frame_count..][..self.frame_count];
             for b in &self.crosses[crosses.clone()] {
                 if a.frame <= b.frame {
-                    self.blocks[a.frame * self.frame_count + b.frame] -=
-                        gain * b.by_point.transpose();
+                    subtract_product_transposed(&mut row[b.frame], &gain, &b.by_point);
                 }
             }
         }
-        let gain = warp_point * cov;
-        self.warp_warp += warp_warp - gain * warp_point.transpose();
-        self.warp_gradient += warp_gradient - gain * point_gradient;
+        let gain = product(&warp_point, &cov);
+        subtract_product_transposed(&mut warp_warp, &gain, &warp_point);
+        self.warp_warp += warp_warp;
+        self.warp_gradient += warp_gradient - product(&gain, &point_gradient);
         self.reduced.push(Reduced {
             landmark: index,
             crosses,
@@ -276,11 +289,11 @@ impl System {
 
     /// The equations of the warp and of all poses but the datum: full symmetric
     /// matrix and right side.
-    pub(super) fn assemble(&self) -> (DMatrix<f64>, DVector<f64>) {
+    pub(super) fn assemble(&self, memory: &mut Memory) -> (DMatrix<f64>, DVector<f64>) {
         let n = self.frame_count;
         let dim = row_of(n);
-        let mut hessian = DMatrix::zeros(dim, dim);
-        let mut gradient = DVector::zeros(dim);
+        let mut hessian = memory.square(dim);
+        let mut gradient = memory.vector(dim);
         hessian
             .fixed_view_mut::<WARP, WARP>(0, 0)
             .copy_from(&self.warp_warp);
@@ -314,11 +327,12 @@ impl System {
     /// Moves the landmarks along with a step of warp and poses, and notes their covariance.
     pub(super) fn move_landmarks(&self, step: &DVector<f64>, landmarks: &mut [Landmark]) {
         for r in &self.reduced {
-            let mut gradient = r.gradient - r.by_warp.transpose() * step.fixed_rows::<WARP>(0);
+            let warp = step.fixed_rows::<WARP>(0).into_owned();
+            let mut gradient = r.gradient - transposed_product(&r.by_warp, &warp);
             for cross in &self.crosses[r.crosses.clone()] {
                 if cross.frame > 0 {
-                    let x = step.fixed_rows::<6>(row_of(cross.frame));
-                    gradient -= cross.by_point.transpose() * x;
+                    let x = step.fixed_rows::<6>(row_of(cross.frame)).into_owned();
+                    gradient -= transposed_product(&cross.by_point, &x);
                 }
             }
             let landmark = &mut landmarks[r.landmark];
@@ -328,13 +342,13 @@ impl System {
     }
 }
 
-/// Robust information, the residual, and the loss (σ²) of one frame's measurement. Huber's bend
+/// Robust information (a diagonal), the residual, and the loss (σ²) of one frame's measurement. Huber's bend
 /// stands at so many σ as residuals really have.
 pub(super) fn weigh(
     residual: &Vector4<f64>,
     sigma_px: &Vector4<f64>,
     variance_factor: f64,
-) -> (Matrix4<f64>, Vector4<f64>, f64) {
+) -> (Vector4<f64>, Vector4<f64>, f64) {
     let scale = variance_factor.sqrt();
     let normalised = residual.component_div(&(sigma_px * scale));
     let (left, right) = (normalised.xy().norm(), normalised.fixed_rows::<2>(2).norm());
@@ -342,7 +356,7 @@ pub(super) fn weigh(
     let info = Vector4::new(wl, wl, wr, wr)
         .component_div(&(sigma_px.component_mul(sigma_px) * variance_factor));
     (
-        Matrix4::from_diagonal(&info),
+        info,
         *residual,
         variance_factor * (huber_loss(left) + huber_loss(right)),
     )

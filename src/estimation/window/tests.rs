@@ -62,11 +62,12 @@ fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, se
             .iter()
             .partition(|s| window.landmark(s.id).is_some());
         let weights = vec![1.0; known.len()];
-        let consent = window
-            .consent(&known, &weights, &step(), k as u64)
+        let mut inliers = Vec::new();
+        let newest_from_now = window
+            .consent(&known, &weights, &step(), k as u64, &mut inliers)
             .expect("agrees");
-        let agreed: Vec<Seen> = consent.inliers.iter().map(|&i| known[i as usize]).collect();
-        window.add(&consent.newest_from_now, &agreed);
+        let agreed: Vec<Seen> = inliers.iter().map(|&i| known[i as usize]).collect();
+        window.add(&newest_from_now, &agreed);
         let tracked = window.adjust().expect("determined");
         let motion_error = se3::log(&(step().inverse() * tracked.motion.prev_from_now));
         run.nees_motion
@@ -201,5 +202,9 @@ fn what_cannot_be_adjusted_leaves_the_window_as_it_was() {
     window.add(&step(), &[]);
     assert!(window.adjust().is_none());
     assert_eq!(window.newest_serial(), before);
-    assert!(window.consent(&[], &[], &step(), 1).is_none());
+    assert!(
+        window
+            .consent(&[], &[], &step(), 1, &mut Vec::new())
+            .is_none()
+    );
 }
