@@ -280,15 +280,22 @@ fn mended(rig: &StereoRig) -> Vec<Mended> {
         "right_from_left.rotation_vector_rad",
         "the rotation runs the other way: negate the rotation vector (a matrix was transposed)",
     );
-    push(
-        extrinsics(Isometry3::from_parts(
-            Translation3::from(t),
-            so3::exp(&(so3::log(&turn) * 1_f64.to_radians())),
-        )),
-        false,
-        "right_from_left.rotation_vector_rad",
-        "the rotation is in degrees: divide it by 57.2958",
-    );
+    let stated = so3::log(&turn);
+    for turns in -2..=2 {
+        // Degrees taken as radians may be more than half a turn, of which a rotation keeps what is left of whole turns.
+        let whole = stated.try_normalize(1e-12).map_or(stated, |axis| {
+            stated + axis * (std::f64::consts::TAU * f64::from(turns))
+        });
+        push(
+            extrinsics(Isometry3::from_parts(
+                Translation3::from(t),
+                so3::exp(&(whole * 1_f64.to_radians())),
+            )),
+            false,
+            "right_from_left.rotation_vector_rad",
+            "the rotation is in degrees: divide it by 57.2958",
+        );
+    }
     push(
         StereoRig {
             left: rig.right.clone(),
