@@ -214,7 +214,7 @@ mod tests {
         let [[left, right], [top, bottom]] = candidate.reach_px();
         let chance = (left * 7.0 + top * 13.0) as u32 % 97;
         let share = (chance % 11) as f32 / 10.0;
-        (chance % 3 > 0).then(|| Keypoint {
+        (!chance.is_multiple_of(3)).then(|| Keypoint {
             x_px: left + share * (right - left),
             y_px: top + (1.0 - share) * (bottom - top),
             response: candidate.response(),

@@ -79,7 +79,7 @@ mod tests {
         let cov = &root * root.transpose();
         let known = by.columns(0, 19);
         let expected = known * &cov * known.transpose();
-        assert!((carried(&by, &cov) - &expected).norm() < 1e-12 * expected.norm());
+        assert!((carried(&by, &cov) - expected).norm() < 1e-12 * expected.norm());
     }
 
     #[test]
