@@ -3,20 +3,15 @@
 //! A channel keeps a list of who waits on it, and a thread a token to wait with; both are made at the
 //! first wait, which may come after any number of pairs. Here it comes before the first.
 
-use crossbeam_channel::{Receiver, Sender};
-use std::time::Duration;
-
-/// Long enough for a thread to give up trying and wait, even where other work keeps it from trying.
-const WAIT: Duration = Duration::from_millis(2);
-const WAITS: usize = 2;
+use crossbeam_channel::{Receiver, Select, Sender};
 
 /// A queue with room for `capacity` items, at least one, whose receivers may have to wait.
 pub(crate) fn bounded<T>(capacity: usize) -> (Sender<T>, Receiver<T>) {
     let (to, from) = crossbeam_channel::bounded(capacity.max(1));
-    for _ in 0..WAITS {
-        // Nothing can come.
-        let _ = from.recv_timeout(WAIT);
-    }
+    let mut wait = Select::new();
+    wait.recv(&from);
+    begin_to_wait(&mut wait);
+    drop(wait);
     (to, from)
 }
 
@@ -27,21 +22,24 @@ pub(crate) fn bounded_both_ways<T>(
 ) -> (Sender<T>, Receiver<T>) {
     let (to, from) = bounded(capacity);
     while to.try_send(blank()).is_ok() {}
-    for _ in 0..WAITS {
-        // Nobody makes room.
-        let _ = to.send_timeout(blank(), WAIT);
-    }
+    let mut wait = Select::new();
+    wait.send(&to);
+    begin_to_wait(&mut wait);
+    drop(wait);
     while from.try_recv().is_ok() {}
     (to, from)
 }
 
-/// Has the calling thread wait once, on nothing.
+/// Has the calling thread begin to wait, on nothing.
 pub(crate) fn prepare_thread() {
-    // Held, for a channel that nobody can send to lets nobody wait.
-    let (_to, nothing) = crossbeam_channel::bounded::<()>(1);
-    for _ in 0..WAITS {
-        let _ = nothing.recv_timeout(WAIT);
-    }
+    drop(bounded::<()>(1));
+}
+
+/// Enters the calling thread in the list of those who wait for what cannot happen, and strikes it out
+/// again: a select does so even where it is only to try.
+fn begin_to_wait(wait: &mut Select<'_>) {
+    let tried = wait.try_select();
+    debug_assert!(tried.is_err(), "nobody else has an end of the queue");
 }
 
 #[cfg(test)]

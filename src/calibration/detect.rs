@@ -22,8 +22,11 @@ const SUBPIXEL_STEP_PX: f64 = 1e-4;
 /// Images longer than this are searched at half their size first; corners are then sought in the full image.
 const COARSE_SIDE_PX: u32 = 1024;
 
-/// Largest area of a circle, px²: OpenCV's own limit is too small for large images.
+/// Least and largest area of a circle, px²: OpenCV's own limits suit neither small nor large images.
+const MIN_CIRCLE_PX2: f32 = 10.0;
 const MAX_CIRCLE_PX2: f32 = 60_000.0;
+/// Least distance of two circles, px: those that are nearer OpenCV takes for one.
+const MIN_CIRCLE_DISTANCE_PX: f32 = 3.0;
 
 /// Why an image could not be searched.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -66,7 +69,9 @@ fn circles(
 ) -> Result<Option<Vector<Point2f>>, DetectError> {
     let mut centres = Vector::<Point2f>::new();
     let mut settings = SimpleBlobDetector_Params::default()?;
+    settings.min_area = MIN_CIRCLE_PX2;
     settings.max_area = MAX_CIRCLE_PX2;
+    settings.min_dist_between_blobs = MIN_CIRCLE_DISTANCE_PX;
     let blobs: Ptr<Feature2D> = SimpleBlobDetector::create(settings)?.into();
     let is_found = calib3d::find_circles_grid(image, size, &mut centres, flags, Some(&blobs))?;
     Ok(is_found.then_some(centres))

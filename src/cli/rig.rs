@@ -14,7 +14,7 @@ const PAIRS: usize = 6;
 
 /// Look after calibration files.
 #[derive(clap::Args)]
-#[command(after_help = "Example: visod rig check rig.toml --images recording")]
+#[command(after_help = "Example: visod rig check rig.toml")]
 pub(crate) struct Args {
     #[command(subcommand)]
     command: Command,

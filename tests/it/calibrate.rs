@@ -161,6 +161,9 @@ mod rendered {
     use visod::calibration::simulated::image;
     use visod::calibration::{Lens, calibrate};
 
+    /// In images this small, about every second board is too far or too tilted to be found.
+    const PLACED: usize = 28;
+
     #[test]
     fn rendered_boards_of_either_kind_give_the_rig_that_they_were_rendered_with() {
         let rig = small_rig();
@@ -172,7 +175,7 @@ mod rendered {
             sigma_square_m: 0.0,
         };
         for (board, sigmas) in [(BOARD, 4.0), (circles, 6.0)] {
-            let placed = placements(&rig, &board, 14, 21);
+            let placed = placements(&rig, &board, PLACED, 21);
             let seen: Vec<_> = placed
                 .iter()
                 .enumerate()
@@ -192,7 +195,7 @@ mod rendered {
                 .collect();
             assert!(
                 seen.len() >= 8,
-                "{:?}: only {} of 14 were found",
+                "{:?}: only {} of {PLACED} were found",
                 board.pattern,
                 seen.len()
             );

@@ -138,9 +138,9 @@ fn mistakes_with_files_are_one_sentence_each() {
         "text.mcap",
         b"hello, this is no recording",
         &[],
-        &["is no MCAP file"],
+        &["no MCAP file either"],
     );
-    refused("empty.mcap", b"", &[], &["cut off"]);
+    refused("empty.mcap", b"", &[], &["no MCAP file either"]);
     let written = Written::new();
     let bytes = std::fs::read(written.file()).unwrap();
     let topics = ["--topics", "/left/image_raw/compressed", "/nowhere"];

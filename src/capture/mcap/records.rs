@@ -3,7 +3,7 @@
 use mcap::records::Record;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use std::fs::File;
-use std::io::Read;
+use std::io::{Read, Seek};
 use std::path::Path;
 
 /// Longest record that is read, bytes: an image of the largest size, and the chunk around it.
@@ -17,7 +17,15 @@ pub(super) struct Records {
 
 impl Records {
     pub(super) fn open(path: &Path) -> Result<Self, String> {
-        let file = File::open(path).map_err(|e| format!("cannot be read: {e}"))?;
+        let unreadable = |e| format!("cannot be read: {e}");
+        let mut file = File::open(path).map_err(unreadable)?;
+        let mut magic = Vec::with_capacity(mcap::MAGIC.len());
+        let beginning = file.by_ref().take(mcap::MAGIC.len() as u64);
+        { beginning }.read_to_end(&mut magic).map_err(unreadable)?;
+        if magic != mcap::MAGIC {
+            return Err("is not a folder with a recording, and no MCAP file either".to_owned());
+        }
+        file.rewind().map_err(unreadable)?;
         let options = LinearReaderOptions::default()
             .with_validate_chunk_crcs(true)
             .with_record_length_limit(MAX_RECORD_BYTES);
@@ -56,8 +64,9 @@ impl Records {
 
 fn sentence(error: &mcap::McapError) -> String {
     match error {
-        mcap::McapError::BadMagic => "is no MCAP file, or was cut off".to_owned(),
-        mcap::McapError::UnexpectedEof | mcap::McapError::UnexpectedEoc => {
+        mcap::McapError::BadMagic
+        | mcap::McapError::UnexpectedEof
+        | mcap::McapError::UnexpectedEoc => {
             "ends in the middle of a record: it was cut off".to_owned()
         }
         other => format!("is damaged: {other}"),
