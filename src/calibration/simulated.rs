@@ -162,7 +162,11 @@ fn grey(
         return wall;
     }
     let at = (origin + direction * distance) / board.square_m;
-    let far = board.point(board.len().saturating_sub(1)) / board.square_m;
+    let mut far = board.point(board.len().saturating_sub(1)) / board.square_m;
+    if board.pattern == Pattern::AsymmetricCircles {
+        // The last row need not be one of those that reach farthest.
+        far.x = (2 * board.columns).saturating_sub(1) as f64;
+    }
     // Squares reach one beyond the inner corners, paper half a square more.
     let beyond = (-at.x).max(-at.y).max(at.x - far.x).max(at.y - far.y);
     if beyond > 1.5 {
@@ -180,7 +184,7 @@ fn grey(
             let row = at.y.round();
             let shift = row.rem_euclid(2.0);
             let x = ((at.x - shift) * 0.5).round() * 2.0 + shift;
-            let is_on_board = (0.0..=far.y).contains(&row) && x >= 0.0 && x <= far.x.max(1.0);
+            let is_on_board = (0.0..=far.y).contains(&row) && x >= 0.0 && x <= far.x;
             is_on_board && (at.xy() - Vector2::new(x, row)).norm() < 0.5
         }
     };
