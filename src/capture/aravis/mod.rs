@@ -1,6 +1,6 @@
 //! A GigE Vision or USB3 Vision camera in, by way of Aravis; its frames out.
 //!
-//! [`discovery`] finds cameras, [`configure`] sets them up, [`pool`] lends the memory that they write
+//! [`discovery`] finds cameras, `configure` sets them up, `pool` lends the memory that they write
 //! to: eight-bit grey images leave without having been copied.
 
 mod action;

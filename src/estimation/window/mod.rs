@@ -9,8 +9,8 @@
 //!
 //! Poses are relative to the oldest keyframe, the *datum*, so that the equations never know how far
 //! the robot has come: nothing loses precision over a long way. What lies before the window is kept
-//! as a Gaussian prior on these relative poses ([`prior`]) and as the datum's own uncertainty, its
-//! correlation with the window included ([`datum`]): marginalisation is exact to first order, so no
+//! as a Gaussian prior on these relative poses (`prior`) and as the datum's own uncertainty, its
+//! correlation with the window included (`datum`): marginalisation is exact to first order, so no
 //! measurement counts twice and none is forgotten.
 //!
 //! Perturbations are right ones, `T ← T · Exp(x)`. Jacobians of poses that the prior knows are
