@@ -213,6 +213,20 @@ pub fn realtime_ns() -> i64 {
     nanoseconds(rustix::time::clock_gettime(rustix::time::ClockId::Realtime))
 }
 
+/// How far this host's CLOCK_REALTIME is ahead of its CLOCK_MONOTONIC, ns. Of a few readings the one
+/// that took the least time: a thread that is interrupted between two clocks compares different times.
+#[must_use]
+pub fn realtime_ahead_ns() -> i64 {
+    let readings = (0..4).map(|_| {
+        let before_ns = monotonic_ns();
+        let realtime_ns = realtime_ns();
+        let took_ns = monotonic_ns() - before_ns;
+        (took_ns, realtime_ns - (before_ns + took_ns / 2))
+    });
+    let quickest = readings.min_by_key(|(took_ns, _)| *took_ns);
+    quickest.map_or(0, |(_, ahead_ns)| ahead_ns)
+}
+
 fn nanoseconds(t: rustix::time::Timespec) -> i64 {
     t.tv_sec * 1_000_000_000 + t.tv_nsec
 }

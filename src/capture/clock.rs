@@ -3,28 +3,16 @@
 //!
 //! A frame arrives a little after it was taken: by a least delay, which is always the same, and by
 //! whatever held it up this time, which is never negative. So the points (stamp, arrival) lie above a
-//! line, whose slope is the ratio of the clocks and whose offset is theirs plus the least delay. Of
-//! all lines below the points the one nearest to them is the edge of their lower convex hull that
-//! spans their mean (it minimises the sum of the distances, which is linear on each edge).
-//!
-//! How well the line is known follows from how densely points lie near it: if the k lowest of n
-//! residuals reach up to r, the line may be wrong by about r/k.
-//!
-//! Source of the idea: clock skew from one-way delays by the convex hull, L. Zhang, Z. Liu, C. H. Xia,
-//! *Clock synchronization algorithms for network measurements*, INFOCOM 2002.
+//! line, whose slope is the ratio of the clocks and whose offset is theirs plus the least delay; the
+//! [`envelope`](super::envelope) of the points finds it.
 
+use super::envelope::{Envelope, LowerLine};
 use std::collections::VecDeque;
 
 /// Most frames that a fit rests on.
 const MAX_SAMPLES: usize = 1024;
 /// Longest time that a fit looks back, ns: oscillators warm up and cool down within minutes.
 const MAX_AGE_NS: i64 = 60_000_000_000;
-/// Largest drift that a crystal may have; more is no crystal, or no frame rate.
-const MAX_DRIFT: f64 = 300e-6;
-/// 1 σ of the drift of a clock that nothing is known about yet.
-const SIGMA_DRIFT: f64 = 30e-6;
-/// The drift is taken from the fit once it is known this well.
-const GOOD_SIGMA_DRIFT: f64 = 15e-6;
 /// A frame cannot arrive before it was taken: one this much too early shows a step of the clock.
 const EARLY_NS: f64 = 20e6;
 /// Frames that arrive this late, one after the other, show a step back.
@@ -85,8 +73,7 @@ pub struct ClockMap {
     /// What wraps have added, ns.
     unwrapped_ns: i64,
     late: Vec<Sample>,
-    hull: Vec<(f64, f64)>,
-    residuals: Vec<f64>,
+    envelope: Envelope,
     /// Mapped stamps rise, whatever the fit does.
     last_host_ns: Option<i64>,
 }
@@ -102,34 +89,29 @@ struct Sample {
 pub struct Fit {
     camera_ref_ns: i64,
     host_ref_ns: i64,
-    /// At the reference, beyond `host_ref − camera_ref`, ns.
-    offset_ns: f64,
-    drift: f64,
-    sigma_offset_ns: f64,
-    sigma_drift: f64,
-    /// Where the offset is known best, ns after the reference.
-    centre_ns: f64,
+    /// What is beyond `host_ref − camera_ref`, by the time after the reference.
+    line: LowerLine,
 }
 
 impl Fit {
     fn at(&self, camera_ns: i64) -> (i64, f64) {
         let x = (camera_ns - self.camera_ref_ns) as f64;
-        let beyond = self.offset_ns + self.drift * x;
+        let beyond = self.line.height_ns + self.line.slope * x;
         let host_ns = self.host_ref_ns + (camera_ns - self.camera_ref_ns) + beyond.round() as i64;
-        let away = self.sigma_drift * (x - self.centre_ns);
-        (host_ns, self.sigma_offset_ns.hypot(away))
+        let away = self.line.sigma_slope * (x - self.line.centre_ns);
+        (host_ns, self.line.sigma_height_ns.hypot(away))
     }
 
     /// How much faster the host's clock runs, as a ratio less one.
     #[must_use]
     pub fn drift(&self) -> f64 {
-        self.drift
+        self.line.slope
     }
 
     /// 1 σ of the drift.
     #[must_use]
     pub fn sigma_drift(&self) -> f64 {
-        self.sigma_drift
+        self.line.sigma_slope
     }
 }
 
@@ -154,8 +136,8 @@ impl ClockMap {
         Some(ClockEstimate {
             offset_ns: host_ns - (last.camera_ns - self.unwrapped_ns),
             sigma_offset_ns,
-            drift_ppm: fit.drift * 1e6,
-            sigma_drift_ppm: fit.sigma_drift * 1e6,
+            drift_ppm: fit.drift() * 1e6,
+            sigma_drift_ppm: fit.sigma_drift() * 1e6,
         })
     }
 
@@ -265,100 +247,15 @@ impl ClockMap {
         else {
             return;
         };
-        let before = self.fit.take();
-        let xy = |s: &Sample| {
+        let points = self.samples.iter().map(|s| {
             let x = s.camera_ns - camera_ns;
             (x as f64, ((s.arrived_ns - arrived_ns) - x) as f64)
-        };
-        lower_hull(self.samples.iter().map(xy), &mut self.hull);
-        let count = self.samples.len() as f64;
-        let mean_x = self.samples.iter().map(|s| xy(s).0).sum::<f64>() / count;
-        let span_ns = -self.hull.first().map_or(0.0, |p| p.0);
-        let slope = self
-            .hull
-            .windows(2)
-            .find(|edge| edge[1].0 >= mean_x)
-            .map_or(0.0, |edge| {
-                (edge[1].1 - edge[0].1) / (edge[1].0 - edge[0].0)
-            });
-        let free = self.line(slope, xy);
-        // The slope of a line held at both ends of the span by points whose distance from it is
-        // about the gap.
-        let sigma_slope = SLOPE_SIGMAS * free.gap_ns / span_ns.max(1.0);
-        let is_good = sigma_slope < GOOD_SIGMA_DRIFT && slope.abs() < MAX_DRIFT;
-        let (line, drift, sigma_drift) = if is_good {
-            (free, slope, sigma_slope)
-        } else {
-            let drift = before.map_or(0.0, |fit| fit.drift);
-            let sigma = before.map_or(SIGMA_DRIFT, |fit| fit.sigma_drift.max(GOOD_SIGMA_DRIFT));
-            (self.line(drift, xy), drift, sigma)
-        };
-        self.fit = Some(Fit {
+        });
+        self.fit = self.envelope.fit(points).map(|line| Fit {
             camera_ref_ns: camera_ns,
             host_ref_ns: arrived_ns,
-            offset_ns: line.offset_ns - line.gap_ns,
-            drift,
-            sigma_offset_ns: OFFSET_SIGMAS * line.gap_ns,
-            sigma_drift,
-            centre_ns: if is_good { mean_x } else { line.touches_ns },
+            line,
         });
-    }
-
-    /// The highest line of a slope that no sample lies below.
-    fn line(&mut self, slope: f64, xy: impl Fn(&Sample) -> (f64, f64)) -> Line {
-        self.residuals.clear();
-        let mut lowest = (f64::INFINITY, 0.0);
-        for sample in &self.samples {
-            let (x, y) = xy(sample);
-            let height = y - slope * x;
-            if height < lowest.0 {
-                lowest = (height, x);
-            }
-            self.residuals.push(height);
-        }
-        let count = self.residuals.len();
-        let near = (count / 2).min(16);
-        let (_, reach, _) = self.residuals.select_nth_unstable_by(near, f64::total_cmp);
-        // As if one more had been seen, held up by what is usual: two that happen to lie close to
-        // each other must not pretend that all do.
-        let usual_ns = USUAL_DELAY_NS / count as f64;
-        let gap_ns = (*reach - lowest.0 + usual_ns) / (near + 1) as f64;
-        Line {
-            offset_ns: lowest.0,
-            touches_ns: lowest.1,
-            gap_ns: gap_ns.max(MIN_GAP_NS),
-        }
-    }
-}
-
-/// 1 σ of the line's height at the mean of the samples, in gaps; measured by simulation with
-/// exponential, uniform and Γ-distributed delays (see the tests).
-const OFFSET_SIGMAS: f64 = 3.0;
-/// 1 σ of its slope, in gaps by the span.
-const SLOPE_SIGMAS: f64 = 9.0;
-/// What a frame is held up by while nothing is known, ns: USB and Ethernet on a busy host.
-const USUAL_DELAY_NS: f64 = 5e6;
-/// Below this a gap says more about the resolution of the stamps than about the delays, ns.
-const MIN_GAP_NS: f64 = 100.0;
-
-struct Line {
-    offset_ns: f64,
-    touches_ns: f64,
-    gap_ns: f64,
-}
-
-/// The lower convex hull of points whose x rise (Andrew's monotone chain).
-fn lower_hull(points: impl Iterator<Item = (f64, f64)>, hull: &mut Vec<(f64, f64)>) {
-    hull.clear();
-    for p in points {
-        while let [.., a, b] = hull[..] {
-            let turn = (b.0 - a.0) * (p.1 - a.1) - (b.1 - a.1) * (p.0 - a.0);
-            if turn > 0.0 {
-                break;
-            }
-            hull.pop();
-        }
-        hull.push(p);
     }
 }
 

@@ -23,6 +23,7 @@ pub mod dataset;
 pub mod decode;
 mod decode_error;
 pub mod drivers;
+mod envelope;
 pub(crate) mod euroc;
 mod euroc_frames;
 pub mod files;

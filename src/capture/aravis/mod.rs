@@ -9,7 +9,8 @@ pub mod discovery;
 mod pool;
 
 use super::camera::{
-    CameraError, CameraEvent, Clock, Frame, FrameSource, Loss, Unwrapped, monotonic_ns, realtime_ns,
+    CameraError, CameraEvent, Clock, Frame, FrameSource, Loss, Unwrapped, monotonic_ns,
+    realtime_ahead_ns,
 };
 use super::pixels::{Converter, PixelLayout};
 use super::settings::{CameraSettings, Trigger};
@@ -233,10 +234,10 @@ impl AravisCamera {
 fn arrival_ns(buffer: &Buffer) -> i64 {
     let now_ns = monotonic_ns();
     let system_ns = i64::try_from(buffer.system_timestamp()).unwrap_or(0);
-    let ago_ns = realtime_ns() - system_ns;
+    let arrived_ns = system_ns - realtime_ahead_ns();
     // Beyond ten seconds the clock was set in between, or there is no such time.
-    if (0..10_000_000_000).contains(&ago_ns) {
-        now_ns - ago_ns
+    if (0..10_000_000_000).contains(&(now_ns - arrived_ns)) {
+        arrived_ns
     } else {
         now_ns
     }
