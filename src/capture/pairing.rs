@@ -108,7 +108,7 @@ pub enum Paired<T> {
 }
 
 /// Frames a side that wait for a partner before they are given up.
-const MAX_WAITING: usize = 8;
+pub(super) const MAX_WAITING: usize = 8;
 /// Pairs by stamp in a row whose numbers differ by the same before that difference is relied upon.
 const PAIRS_TO_LEARN: u32 = 3;
 /// 1 σ of the time between the exposures that one pulse triggers, ns.

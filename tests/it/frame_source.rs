@@ -45,6 +45,9 @@ fn patiently<T: Send + 'static>(work: impl FnOnce() -> T + Send + 'static) -> T 
 /// All events to the end, where the source must stay at its end.
 fn played<S: PairSource + 'static>(mut source: S, recycle: bool) -> Vec<PairEvent> {
     patiently(move || {
+        if recycle {
+            source.make_room(1);
+        }
         let hint = source.len_hint();
         let mut events = Vec::new();
         while let Some(event) = source.next_event() {

@@ -3,6 +3,7 @@
 //! The latter needs a Python with `mcap` and `mcap-ros2-support`: that of `VISOD_PYTHON`, else
 //! `python3`. Without one these tests say so and do nothing.
 
+use super::frame_source::{Expected, assert_conforms};
 use super::replay::{Recording, replay_quietly, stderr_of, visod};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
@@ -12,6 +13,7 @@ use tempfile::TempDir;
 use visod::capture::dataset::Settings;
 use visod::capture::mcap::McapRecording;
 use visod::capture::{Dataset, PairEvent, PairSource, ReadAhead, StereoPair};
+use visod::image::GrayImage;
 use visod::output::csv::read_odometry_csv;
 
 /// A recording and the MCAP file that its replay wrote.
@@ -72,6 +74,21 @@ fn a_replay_of_what_a_replay_wrote_gives_the_same_bytes() {
     assert!(pairs == pairs_of_folder(written.recording.path()));
     let again = replay_quietly(&written.file(), &[]);
     assert_eq!(again.csv, written.csv);
+}
+
+#[test]
+fn a_source_from_mcap_conforms() {
+    let written = Written::new();
+    let events = pairs_of_folder(written.recording.path());
+    let size_px = |image: &GrayImage| (image.width(), image.height());
+    let expected = Expected {
+        events: events.len() as u64,
+        sizes_px: [size_px(&events[0].left), size_px(&events[0].right)],
+        unusable: vec![],
+    };
+    let file = written.file();
+    let recording = McapRecording::open(&file, None, None, Settings::default()).unwrap();
+    assert_conforms(&expected, || recording.source().unwrap());
 }
 
 #[test]

@@ -22,7 +22,8 @@ pub struct McapSource {
     waiting: [VecDeque<Waiting>; 2],
     tolerance_ns: i64,
     sequence: u64,
-    spare: Vec<GrayImage>,
+    sizes_px: [(u32, u32); 2],
+    spare: [Vec<GrayImage>; 2],
     /// Why the file ends early, to be said once.
     cut: Option<String>,
     last_ns: Option<i64>,
@@ -43,15 +44,17 @@ impl McapSource {
     pub(super) fn open(recording: &McapRecording) -> std::io::Result<Self> {
         let records = Records::open(&recording.file).map_err(std::io::Error::other)?;
         let (rig, white_level) = (&recording.rig, recording.settings.white_level);
+        let sizes_px = [&rig.left, &rig.right].map(|camera| (camera.width, camera.height));
         Ok(Self {
             file: recording.file.display().to_string(),
             records: Some(records),
             topics: recording.topics.clone(),
-            images: [&rig.left, &rig.right].map(|c| Images::new((c.width, c.height), white_level)),
+            images: sizes_px.map(|size_px| Images::new(size_px, white_level)),
             waiting: [VecDeque::new(), VecDeque::new()],
             tolerance_ns: recording.settings.pairing_tolerance_ns(),
             sequence: 0,
-            spare: Vec::new(),
+            sizes_px,
+            spare: Default::default(),
             cut: None,
             last_ns: None,
         })
@@ -139,8 +142,12 @@ impl McapSource {
             (Err(left), Err(right)) => {
                 unusable(sequence, Some(timestamp_ns), format!("{left}; {right}"))
             }
-            (Ok(image), Err(why)) | (Err(why), Ok(image)) => {
-                self.spare.push(image);
+            (Ok(image), Err(why)) => {
+                self.spare[Side::Left as usize].push(image);
+                unusable(sequence, Some(timestamp_ns), why)
+            }
+            (Err(why), Ok(image)) => {
+                self.spare[Side::Right as usize].push(image);
                 unusable(sequence, Some(timestamp_ns), why)
             }
         }
@@ -149,7 +156,7 @@ impl McapSource {
     fn decode(&mut self, side: Side, waiting: Waiting) -> Result<GrayImage, String> {
         let topic = &self.topics[side as usize].name;
         let named = |why| format!("{}: {topic}: {why}", self.file);
-        let mut image = self.spare.pop().unwrap_or_default();
+        let mut image = self.spare[side as usize].pop().unwrap_or_default();
         let images = &mut self.images[side as usize];
         let done = match &waiting.content {
             Ok(Content::Raw(message)) => images.raw(message, &mut image).map_err(named),
@@ -161,7 +168,7 @@ impl McapSource {
         match done {
             Ok(()) => Ok(image),
             Err(why) => {
-                self.spare.push(image);
+                self.spare[side as usize].push(image);
                 Err(why)
             }
         }
@@ -243,7 +250,17 @@ impl PairSource for McapSource {
         }
     }
 
+    /// One image a side more than are held: that which is being decoded.
+    fn make_room(&mut self, pairs_held: usize) {
+        for (spare, (width, height)) in self.spare.iter_mut().zip(self.sizes_px) {
+            let more = (pairs_held + 1).saturating_sub(spare.len());
+            spare.extend((0..more).map(|_| GrayImage::filled(width, height, 0)));
+        }
+    }
+
     fn recycle(&mut self, pair: StereoPair) {
-        self.spare.extend([pair.left, pair.right]);
+        let [left, right] = &mut self.spare;
+        left.push(pair.left);
+        right.push(pair.right);
     }
 }
