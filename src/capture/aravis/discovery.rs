@@ -5,7 +5,9 @@ use aravis::Camera;
 use aravis::prelude::*;
 use glib::prelude::Cast;
 use serde::Serialize;
+use std::collections::BTreeMap;
 use std::ffi::{CStr, c_char};
+use std::net::IpAddr;
 use std::sync::{Mutex, PoisonError};
 
 /// A camera on one of the host's networks or buses.
@@ -64,8 +66,9 @@ pub struct Details {
     pub cause: Option<String>,
 }
 
-/// Aravis' list of devices is one for the process.
-static LIST: Mutex<()> = Mutex::new(());
+/// Aravis' list of devices is one for the process; here with where cameras were found, by what their
+/// owner calls them.
+static LIST: Mutex<BTreeMap<String, Found>> = Mutex::new(BTreeMap::new());
 
 /// Looks for cameras on all networks and buses; takes about a second.
 #[must_use]
@@ -114,15 +117,15 @@ unsafe fn text(text: *const c_char) -> String {
 /// Opens the camera that is called `name`: its id, serial number, address, hardware address or the
 /// name that its user gave it.
 pub(super) fn open(name: &str) -> Result<(Camera, Found), CameraError> {
-    let _guard = LIST.lock().unwrap_or_else(PoisonError::into_inner);
-    let cameras = list_locked();
-    let found = cameras.iter().find(|camera| camera.is_called(name));
-    // Aravis itself knows names that the list does not show, and addresses beyond the next router.
-    let wanted = found.map_or(name, |camera| camera.id.as_str());
-    let camera = Camera::new(Some(wanted)).map_err(|e| refusal(name, &cameras, &e))?;
-    let device = camera.device();
+    let mut known = LIST.lock().unwrap_or_else(PoisonError::into_inner);
+    let again = known.get(name).and_then(open_again);
+    let (camera, found) = match again {
+        Some(opened) => opened,
+        None => open_listed(name)?,
+    };
     // Whoever comes second may look, but not touch: said now, rather than by the first setting.
-    if let Some(device) = device
+    if let Some(device) = camera
+        .device()
         .as_ref()
         .and_then(|d| d.downcast_ref::<aravis::GvDevice>())
         && !device.is_controller()
@@ -131,6 +134,25 @@ pub(super) fn open(name: &str) -> Result<(Camera, Found), CameraError> {
             "{name}: another program holds it"
         )));
     }
+    known.insert(name.to_owned(), found.clone());
+    Ok((camera, found))
+}
+
+/// A camera that comes back is usually where it was. One that is asked for itself answers at once; a
+/// list waits a second for all that may answer.
+fn open_again(known: &Found) -> Option<(Camera, Found)> {
+    known.address.parse::<IpAddr>().ok()?;
+    let camera = Camera::new(Some(&known.address)).ok()?;
+    let is_same = described(&camera, &known.id).identity() == known.identity();
+    is_same.then(|| (camera, known.clone()))
+}
+
+fn open_listed(name: &str) -> Result<(Camera, Found), CameraError> {
+    let cameras = list_locked();
+    let found = cameras.iter().find(|camera| camera.is_called(name));
+    // Aravis itself knows names that the list does not show, and addresses beyond the next router.
+    let wanted = found.map_or(name, |camera| camera.id.as_str());
+    let camera = Camera::new(Some(wanted)).map_err(|e| refusal(name, &cameras, &e))?;
     let found = match found {
         Some(found) => found.clone(),
         None => described(&camera, name),
