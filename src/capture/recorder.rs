@@ -16,7 +16,7 @@ use std::io::{self, Write};
 use std::path::{Path, PathBuf};
 
 /// Header of `frames.csv`.
-const FRAMES_HEADER: &str = "camera,number,stamp_ns,host_ns,fate,detail\n";
+const FRAMES_HEADER: &str = "camera,number,stamp_ns,host_ns,fate,detail,arrived_ns\n";
 
 /// Why a recording cannot go on.
 #[derive(Debug, thiserror::Error)]
@@ -145,11 +145,12 @@ impl Recorder {
         };
         let number = |n: Option<i128>| n.map_or(String::new(), |n| n.to_string());
         format!(
-            "{},{},{},{},{fate},{detail}\n",
+            "{},{},{},{},{fate},{detail},{}\n",
             name_of(entry.side),
             number(entry.number.map(i128::from)),
             number(entry.stamp_ns.map(i128::from)),
             number(entry.host_ns.map(i128::from)),
+            number(entry.arrived_ns.map(i128::from)),
         )
     }
 }
@@ -235,6 +236,7 @@ mod tests {
             number: Some(7),
             stamp_ns: Some(-5),
             host_ns: None,
+            arrived_ns: Some(3),
             fate,
         }
     }
@@ -295,11 +297,11 @@ mod tests {
         assert_eq!(
             lines,
             [
-                "left,7,-5,,written,0",
-                "right,7,-5,,not_written,failed",
-                "left,7,-5,,written,1",
-                "left,7,-5,,not_written,dropped",
-                "right,7,-5,,unmatched,other_silent"
+                "left,7,-5,,written,0,3",
+                "right,7,-5,,not_written,failed,3",
+                "left,7,-5,,written,1,3",
+                "left,7,-5,,not_written,dropped,3",
+                "right,7,-5,,unmatched,other_silent,3"
             ]
         );
     }

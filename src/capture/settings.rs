@@ -23,7 +23,8 @@ pub struct Settings {
     /// cameras whose clock means something, such as PTP's. Default `host`.
     pub stamps: Stamps,
     /// 1 σ of the difference between the least delays of the two cameras' frames, which stamps cannot
-    /// show. s, 0 to 0.1, default 0.0001: like cameras on like cables.
+    /// show. s, 0 to 0.1, default 0.0001: like cameras on like cables, on a computer that has a processor
+    /// for each when it comes (`service.priority`).
     pub sigma_transit_s: f64,
     /// Time without a frame after which a camera counts as stalled, and is opened anew. s, 0.1 to 60,
     /// default 2: longer than any exposure or hiccup.

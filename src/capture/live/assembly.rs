@@ -49,6 +49,7 @@ struct Waiting {
     image: GrayImage,
     stamp_ns: i64,
     host_ns: i64,
+    arrived_ns: i64,
 }
 
 impl Assembly {
@@ -114,6 +115,7 @@ impl Assembly {
                 image: frame.image,
                 stamp_ns: frame.stamp_ns,
                 host_ns: taken.host_ns,
+                arrived_ns: frame.arrived_ns,
             },
         };
         self.pairer.push(side, candidate);
@@ -244,6 +246,7 @@ fn entry(side: Side, frame: &Candidate<Waiting>, fate: Fate) -> Entry {
         number: Some(frame.number),
         stamp_ns: Some(frame.item.stamp_ns),
         host_ns: Some(frame.item.host_ns),
+        arrived_ns: Some(frame.item.arrived_ns),
         fate,
     }
 }

@@ -32,6 +32,8 @@ pub struct Entry {
     pub stamp_ns: Option<i64>,
     /// The same in the host's CLOCK_MONOTONIC, ns.
     pub host_ns: Option<i64>,
+    /// When the first of it arrived, CLOCK_MONOTONIC, ns.
+    pub arrived_ns: Option<i64>,
     /// What became of it.
     pub fate: Fate,
 }
@@ -64,6 +66,7 @@ impl Journal {
             number: None,
             stamp_ns: None,
             host_ns: None,
+            arrived_ns: None,
             fate,
         });
     }
