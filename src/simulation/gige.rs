@@ -19,6 +19,11 @@ use std::time::{Duration, SystemTime, UNIX_EPOCH};
 /// control channel on the same thread: it must not sleep for long.
 const PATIENCE: Duration = Duration::from_millis(1500);
 
+/// How many numbers a camera that leaves none out may be ahead of the other before it waits.
+const MOST_AHEAD: i64 = 2;
+/// How long it waits at most.
+const PATIENCE_AHEAD: Duration = Duration::from_millis(100);
+
 /// The images of a recording, whole.
 pub trait Images: Send + Sync {
     /// How many pairs there are.
@@ -139,7 +144,7 @@ pub struct Together {
 }
 
 impl Together {
-    /// Cameras that a busy machine makes late leave no number out, but fall behind.
+    /// Cameras that a busy machine makes late leave no number out, but fall behind, together.
     #[must_use]
     pub fn leaving_none_out() -> Self {
         Self {
@@ -154,6 +159,8 @@ struct Start {
     is_running: [bool; 2],
     /// The tick of number 0.
     first_tick: Option<i64>,
+    /// The last numbers that were due.
+    last: [i64; 2],
 }
 
 struct Filler {
@@ -266,7 +273,28 @@ impl Filler {
             Some(last) => (tick - first).max(last + 1),
         };
         *last = Some(due);
+        if self.together.leaves_none_out {
+            self.wait_for_other(due);
+        }
         due
+    }
+
+    /// Waits a little where the other camera is far behind: apart, they would send what no longer belongs
+    /// together.
+    fn wait_for_other(&self, due: i64) {
+        let together = &self.together;
+        let mut start = together
+            .state
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner);
+        start.last[self.side as usize] = due;
+        together.changed.notify_all();
+        let other = 1 - self.side as usize;
+        let is_behind =
+            |start: &mut Start| start.is_running[other] && start.last[other] + MOST_AHEAD < due;
+        let _ = together
+            .changed
+            .wait_timeout_while(start, PATIENCE_AHEAD, is_behind);
     }
 
     /// The tick at which the recording began, or begins now that both cameras run.
