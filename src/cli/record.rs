@@ -80,6 +80,7 @@ fn record(
 ) -> Result<(), RecordError> {
     let bar = progress::pairs(pairs);
     let mut held: Vec<Entry> = Vec::new();
+    source.make_room(1);
     while pairs.is_none_or(|pairs| recorder.count() < pairs) {
         let Some(event) = source.next_event() else {
             break;
