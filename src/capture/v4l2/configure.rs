@@ -81,10 +81,7 @@ fn set_format(
             .ok_or_else(|| {
                 unsuitable(
                     name,
-                    format_args!(
-                        "has no pixel format {wanted}; it has {}",
-                        offered.join(", ")
-                    ),
+                    format_args!("has no pixel format {wanted}; it has {}", usable(&offered)),
                 )
             })?,
         None => PREFERRED_FORMATS
@@ -130,6 +127,18 @@ fn set_format(
         layout,
         stride: set.stride as usize,
     })
+}
+
+/// Those of the formats that can be turned into grey, for people.
+fn usable(offered: &[String]) -> String {
+    let usable = offered
+        .iter()
+        .filter(|f| PixelLayout::of_fourcc(f).is_some());
+    let names: Vec<&str> = usable.map(|format| format.trim_end()).collect();
+    if names.is_empty() {
+        return "none that can be turned into grey".to_owned();
+    }
+    names.join(", ")
 }
 
 fn fourcc_of(text: &str) -> FourCC {
