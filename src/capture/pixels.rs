@@ -423,6 +423,53 @@ mod tests {
         assert_eq!(PixelLayout::of_fourcc("H264"), None);
     }
 
+    /// A grey gradient as a camera's JPEG, and its pixels.
+    fn jpeg() -> (Vec<u8>, GrayImage) {
+        let mut image = GrayImage::filled(32, 16, 0);
+        for (n, pixel) in image.pixels_mut().iter_mut().enumerate() {
+            *pixel = (5 * (n % 32) + 3 * (n / 32)) as u8;
+        }
+        let mut bytes = Vec::new();
+        image::codecs::jpeg::JpegEncoder::new_with_quality(&mut bytes, 95)
+            .encode(image.pixels(), 32, 16, image::ExtendedColorType::L8)
+            .expect("encoded");
+        (bytes, image)
+    }
+
+    /// The same as many cameras send it: marked as a frame of a video, without the Huffman tables that all
+    /// of those share.
+    fn without_tables(jpeg: &[u8]) -> Vec<u8> {
+        let mut bytes = b"\xFF\xD8\xFF\xE0\x00\x10AVI1\0\0\0\0\0\0\0\0\0\0".to_vec();
+        let mut at = 2;
+        loop {
+            let end = at + 2 + usize::from(u16::from_be_bytes([jpeg[at + 2], jpeg[at + 3]]));
+            match jpeg[at + 1] {
+                0xC4 | 0xE0 => {}
+                0xDA => {
+                    bytes.extend(&jpeg[at..]);
+                    return bytes;
+                }
+                _ => bytes.extend(&jpeg[at..end]),
+            }
+            at = end;
+        }
+    }
+
+    #[test]
+    fn a_jpeg_is_the_grey_that_went_into_it_with_its_tables_or_without() {
+        let (jpeg, truth) = jpeg();
+        let bare = without_tables(&jpeg);
+        assert!(bare.len() + 100 < jpeg.len(), "the tables are gone");
+        for bytes in [jpeg, bare] {
+            let mut converter = Converter::new(PixelLayout::Mjpg, (32, 16), 0, None);
+            let mut image = GrayImage::default();
+            converter.convert(&bytes, &mut image).expect("converted");
+            let pixels = image.pixels().iter().zip(truth.pixels());
+            let worst = pixels.map(|(a, b)| a.abs_diff(*b)).max();
+            assert!(worst <= Some(3), "{worst:?}");
+        }
+    }
+
     #[test]
     fn a_jpeg_of_the_wrong_size_or_that_is_none_is_refused() {
         let mut converter = Converter::new(PixelLayout::Mjpg, (8, 8), 0, None);
@@ -431,5 +478,9 @@ mod tests {
             .convert(b"no jpeg", &mut image)
             .expect_err("refused");
         assert!(why.starts_with("the camera's JPEG"), "{why}");
+        let why = converter
+            .convert(&jpeg().0, &mut image)
+            .expect_err("refused");
+        assert!(why.contains("32×16"), "{why}");
     }
 }

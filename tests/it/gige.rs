@@ -3,7 +3,7 @@
 //! Each test runs in a network namespace of its own, made by `unshare`, where discovery reaches nobody
 //! else. Where that is not allowed, the tests say so and pass over.
 
-use super::one_camera::assert_camera_conforms;
+use super::one_camera::{assert_camera_conforms, assert_leaves, assert_unsuitable};
 use super::publication::System;
 use super::replay::{replay_quietly, stderr_of, visod};
 use serde_json::Value;
@@ -14,7 +14,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 use tempfile::TempDir;
 use visod::capture::aravis::AravisCamera;
-use visod::capture::camera::{CameraError, FrameSource};
+use visod::capture::camera::FrameSource;
 use visod::capture::settings::{CameraSettings, Trigger};
 use visod::capture::{Dataset, PairEvent, PairSource, ReadAhead, Side};
 use visod::geometry::rig_to_toml;
@@ -338,6 +338,15 @@ fn a_gige_camera_conforms() {
             Ok(Box::new(camera) as Box<dyn FrameSource>)
         };
         assert_camera_conforms(&open, (320, 240), true);
+        let wrong = CameraSettings {
+            pixel_format: Some("Mono7".to_owned()),
+            ..settings.clone()
+        };
+        let open = || {
+            let camera = AravisCamera::open(&wrong, (320, 240))?;
+            Ok(Box::new(camera) as Box<dyn FrameSource>)
+        };
+        assert_unsuitable(&open, "has no pixel format Mono7");
     }
 }
 
@@ -351,23 +360,11 @@ fn a_gige_camera_that_is_unplugged_is_gone() {
         id: "Aravis-Fake-LEFT".to_owned(),
         ..CameraSettings::default()
     };
-    let mut camera = AravisCamera::open(&settings, (320, 240)).unwrap();
-    camera.start().unwrap();
-    rig.unplug(Side::Left);
-    let started = Instant::now();
-    let error = loop {
-        if let Err(e) = camera.next(Duration::from_millis(100)) {
-            break e;
-        }
-        assert!(
-            started.elapsed() < Duration::from_secs(20),
-            "it is not noticed"
-        );
+    let open = || {
+        let camera = AravisCamera::open(&settings, (320, 240))?;
+        Ok(Box::new(camera) as Box<dyn FrameSource>)
     };
-    assert!(
-        matches!(&error, CameraError::Gone(why) if why.contains("control was lost")),
-        "{error}"
-    );
+    assert_leaves(&open, || rig.unplug(Side::Left), "control was lost");
 }
 
 /// What the cameras show is what `record` writes, and what `run` makes of it is what `replay` does.
@@ -401,6 +398,11 @@ fn recorded_pixels_are_those_served_and_the_trajectory_is_that_of_a_replay() {
     let summary = json(&run("run", &config, &args));
     println!("{summary}");
     assert_eq!(summary["dropped"], 0);
+    for camera in summary["cameras"].as_array().unwrap() {
+        let lost = camera["lost"].as_object().unwrap();
+        assert!(lost.values().all(|frames| *frames == 0), "{camera}");
+        assert_eq!(camera["reconnects"], 0);
+    }
     let live = without_latency(&std::fs::read_to_string(&csv).unwrap());
     // A busy machine may follow more slowly than the cameras send: what waits when the time is up has no row.
     assert!(live.len() as u64 >= 2 * seconds, "{} rows", live.len());
@@ -524,11 +526,9 @@ fn at_forty_hertz_every_frame_is_counted() {
     let rig = Rig::with(RENDERED, 40.0, CameraClock::default(), Late::Skip);
     let folder = tempfile::tempdir().unwrap();
     let config = rig.config(folder.path(), None, "", "");
-    let summary = json(&run(
-        "run",
-        &config,
-        &["--json", "--no-publish", "--seconds", "6"],
-    ));
+    let time = seconds().max(6).to_string();
+    let args = ["--json", "--no-publish", "--seconds", &time];
+    let summary = json(&run("run", &config, &args));
     println!("{summary}");
     for at in 0..2 {
         let camera = &summary["cameras"][at];
@@ -568,26 +568,17 @@ fn clocks_that_differ_do_not_part_pairs() {
 }
 
 /// The difference between two clocks, 3 ms and 50 ppm apart, is estimated as well as the estimate says.
+///
+/// But for the least delay, that is, which stamps cannot show: where this machine is so busy that not one
+/// frame of a camera is punctual, it is not that of the cable. So it is taken from what arrived.
 #[test]
 fn the_offset_between_clocks_is_known_as_well_as_it_says() {
     if !in_namespace("gige::the_offset_between_clocks_is_known_as_well_as_it_says") {
         return;
     }
-    // Where a machine is so busy that not one frame of a camera is punctual, its least delay is not seen.
-    let is_known = (0..4).any(|_| {
-        let (wrong_ns, sigma_ns) = offset_of_clocks();
-        assert!(sigma_ns < 2e6, "that says nothing: {sigma_ns} ns");
-        wrong_ns.abs() < 3.0 * sigma_ns
-    });
-    assert!(is_known);
-}
-
-/// How wrong the estimated offset between two clocks is, and its 1 σ, ns.
-fn offset_of_clocks() -> (f64, f64) {
     // Stamps that say when a frame was really taken: a busy machine takes it late, as no camera does.
-    let shows = Shows::Host {
-        since_ns: visod::capture::camera::monotonic_ns(),
-    };
+    let since_ns = visod::capture::camera::monotonic_ns();
+    let shows = Shows::Host { since_ns };
     let left = CameraClock {
         shows,
         ..CameraClock::default()
@@ -605,33 +596,44 @@ fn offset_of_clocks() -> (f64, f64) {
     let recorded = json(&run("record", &config, &args));
     println!("{recorded}");
     let [(left_ns, left_sigma_ns), (right_ns, right_sigma_ns)] = [0, 1].map(|at| {
-        let clock = &recorded["clocks"][at];
-        let sigma_ns = clock["sigma_offset_ns"].as_f64().unwrap();
-        (clock["offset_ns"].as_i64().unwrap(), sigma_ns)
+        let estimate = &recorded["clocks"][at];
+        let (clock, side) = [(left, "left"), (right, "right")][at];
+        let arrivals = arrivals(&out, side, &clock, since_ns);
+        let delays = arrivals.iter().map(|(taken, arrived)| arrived - taken);
+        let least_ns = delays.fold(f64::INFINITY, f64::min);
+        let (last_ns, _) = arrivals[arrivals.len() - 1];
+        let ahead_ns = clock.offset_ns as f64 + clock.drift * (last_ns - since_ns as f64);
+        let wrong_ns = estimate["offset_ns"].as_f64().unwrap() + ahead_ns - least_ns;
+        let sigma_ns = estimate["sigma_offset_ns"].as_f64().unwrap();
+        println!(
+            "{side}: least delay {:.1} µs; offset wrong by {:.1} µs, 1 σ {:.1} µs",
+            least_ns * 1e-3,
+            wrong_ns * 1e-3,
+            sigma_ns * 1e-3
+        );
+        (wrong_ns, sigma_ns)
     });
-    let Shows::Host { since_ns } = shows else {
-        unreachable!();
-    };
-    let elapsed_ns = (last_stamp_ns(&out, "right") - since_ns - right.offset_ns) as f64;
-    let ahead_ns = right.offset_ns as f64 + right.drift * elapsed_ns;
-    // The left clock is right: both differ from it by the same least delay, but for what `sigma_transit_s`
-    // allows by default.
-    let wrong_ns = (left_ns - right_ns) as f64 - ahead_ns;
-    let sigma_ns = left_sigma_ns.hypot(right_sigma_ns).hypot(1e5);
-    println!(
-        "offset of the clocks wrong by {:.1} µs, 1 σ {:.1} µs",
-        wrong_ns * 1e-3,
-        sigma_ns * 1e-3
+    let sigma_ns = left_sigma_ns.hypot(right_sigma_ns);
+    let wrong_ns = left_ns - right_ns;
+    assert!(sigma_ns < 2e6, "that says nothing: {sigma_ns} ns");
+    assert!(
+        wrong_ns.abs() < 3.0 * sigma_ns,
+        "{wrong_ns} of {sigma_ns} ns"
     );
-    (wrong_ns, sigma_ns)
 }
 
-/// The camera's own stamp of the last frame of a side in `frames.csv`.
-fn last_stamp_ns(recording: &Path, side: &str) -> i64 {
+/// When each frame of a side in `frames.csv` was taken and when it arrived, CLOCK_MONOTONIC, ns.
+fn arrivals(recording: &Path, side: &str, clock: &CameraClock, since_ns: i64) -> Vec<(f64, f64)> {
     let frames = std::fs::read_to_string(recording.join("frames.csv")).unwrap();
-    let of_side = frames.lines().rev().filter(|line| line.starts_with(side));
-    let stamps = of_side.filter_map(|line| line.split(',').nth(2)?.parse().ok());
-    stamps.into_iter().next().unwrap()
+    let of_side = frames.lines().filter(|line| line.starts_with(side));
+    let times = of_side.filter_map(|line| {
+        let columns: Vec<&str> = line.split(',').collect();
+        let stamp_ns: f64 = columns[2].parse().ok()?;
+        let arrived_ns: f64 = columns[6].parse().ok()?;
+        let own_ns = stamp_ns - since_ns as f64 - clock.offset_ns as f64;
+        Some((since_ns as f64 + own_ns / (1.0 + clock.drift), arrived_ns))
+    });
+    times.collect()
 }
 
 /// Health as it is heard, with when.
@@ -693,7 +695,7 @@ fn a_camera_that_is_unplugged_for_five_seconds_comes_back() {
     std::thread::sleep(Duration::from_secs(5).saturating_sub(gone.elapsed()));
     rig.plug(Side::Right);
     let took = listener.wait("streaming", 8, |m| m.right_state == STREAMING);
-    assert!(took < 2.5, "{took} s");
+    assert!(took < 2.0, "{took} s");
     listener.wait("well", 8, is_well);
     let (output, _) = daemon.stop();
     let summary = json(&output);

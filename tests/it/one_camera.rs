@@ -53,6 +53,42 @@ pub(crate) fn assert_camera_conforms(open: Open<'_>, size_px: (u32, u32), is_end
     drop(open().expect("one that never started can be dropped, too"));
 }
 
+/// Holds a camera's refusal of what it cannot do to its contract: one sentence, and no use in trying again.
+pub(crate) fn assert_unsuitable(open: Open<'_>, says: &str) {
+    let error = open().err().expect("refused");
+    assert!(error.is_permanent(), "{error:?}");
+    assert_sentence(&error, says);
+}
+
+/// Holds a camera that `leave` takes away while it streams to the contract: its stream ends with an error
+/// that says so, and opening it anew fails until it is back.
+pub(crate) fn assert_leaves(open: Open<'_>, leave: impl FnOnce(), says: &str) {
+    let mut source = open().expect("it is there");
+    source.start().expect("starts");
+    frames(&mut *source, 2, true);
+    leave();
+    let started = Instant::now();
+    let error = loop {
+        if let Err(e) = source.next(Duration::from_millis(50)) {
+            break e;
+        }
+        assert!(started.elapsed() < PATIENCE, "it is not noticed");
+    };
+    assert!(matches!(error, CameraError::Gone(_)), "{error:?}");
+    assert_sentence(&error, says);
+    drop(source);
+    let error = open().err().expect("it is not there");
+    assert!(!error.is_permanent(), "it may come back: {error:?}");
+    assert_sentence(&error, "");
+}
+
+fn assert_sentence(error: &CameraError, says: &str) {
+    let text = error.to_string();
+    println!("{text}");
+    assert!(!text.is_empty() && !text.contains('\n'), "{text}");
+    assert!(text.contains(says), "no '{says}' in: {text}");
+}
+
 /// Takes some frames; giving them back changes nothing.
 fn frames(source: &mut dyn FrameSource, count: usize, recycle: bool) -> Vec<Frame> {
     let started = Instant::now();
@@ -158,6 +194,10 @@ fn a_recording_of_another_size_than_the_rig_is_refused() {
     let mut rig = recording.open().rig;
     rig.right.width *= 2;
     let dataset = Dataset::open(recording.path(), Some(rig)).expect("a recording");
-    let error = FileCamera::open(&dataset, Side::Right, "files").expect_err("refused");
-    assert!(error.is_permanent(), "{error}");
+    let open = || {
+        let camera = FileCamera::open(&dataset, Side::Right, "files")?;
+        Ok(Box::new(camera) as Box<dyn FrameSource>)
+    };
+    let size = format!("{}×{HEIGHT}", 2 * WIDTH);
+    assert_unsuitable(&open, &size);
 }
