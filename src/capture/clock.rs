@@ -4,7 +4,7 @@
 //! A frame arrives a little after it was taken: by a least delay, which is always the same, and by
 //! whatever held it up this time, which is never negative. So the points (stamp, arrival) lie above a
 //! line, whose slope is the ratio of the clocks and whose offset is theirs plus the least delay; the
-//! [`envelope`](super::envelope) of the points finds it.
+//! lower envelope of the points (`envelope`) finds it.
 
 use super::envelope::{Envelope, LowerLine};
 use std::collections::VecDeque;
