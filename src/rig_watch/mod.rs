@@ -51,6 +51,8 @@ const LEAST: usize = 30;
 const BLOW_RAD: f64 = 2e-3;
 /// Pairs after a blow for which landmarks, which follow it, are not asked about another one.
 const PAIRS_OF_REST: u32 = 20;
+/// Pairs at the start that tell how the rig was when it was calibrated.
+const PAIRS_TO_LEARN: u32 = 10;
 /// A yaw is known where its σ is below this; otherwise the camera is taken not to have turned that way.
 const KNOWN_YAW_RAD: f64 = 1e-4;
 /// What is but suspicious, beyond the middle of what chance shows, is not learnt as the calibration's own error.
@@ -88,6 +90,8 @@ pub struct RigWatch {
     /// The yaw before the last blow.
     yaw_before_rad: f64,
     pairs_since_blow: u32,
+    /// Pairs from which what calibration missed is yet to be learnt before anything is called a blow.
+    pairs_to_learn: u32,
     has_moved: bool,
     misfits: bool,
 }
@@ -139,6 +143,7 @@ impl RigWatch {
             applied_rad: Vector3::zeros(),
             yaw_before_rad: 0.0,
             pairs_since_blow: PAIRS_OF_REST + 1,
+            pairs_to_learn: PAIRS_TO_LEARN,
             has_moved: false,
             misfits: false,
         })
@@ -189,7 +194,10 @@ impl RigWatch {
         let mut step = self.step.say();
         let mut is_suspicious = false;
         let mut is_blow = false;
-        if let Some(rows) = &rows {
+        if rows.is_some() && self.pairs_to_learn > 0 {
+            // As it is at first, so it was calibrated.
+            self.pairs_to_learn -= 1;
+        } else if let Some(rows) = &rows {
             let doubt = self.rows_alarm.add(rows, &self.filter);
             is_suspicious = doubt > self.limits.suspicious;
             is_blow = doubt > self.limits.turn;
