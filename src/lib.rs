@@ -13,7 +13,7 @@
 //!
 //! Below them lie [`geometry`] and [`uncertainty`], which know nothing of stages; above them
 //! [`pipeline`] (threads), [`service`] (systemd, scheduling), [`config`] and `cli`. Beside them stand
-//! [`simulation`], which renders recordings with known truth, [`calibration`], which finds a rig from
+//! [`rig_watch`], which looks after the rig while it works, [`simulation`], which renders recordings with known truth, [`calibration`], which finds a rig from
 //! views of a board, [`montecarlo`], which holds covariances against the errors of many
 //! runs, and [`evaluation`], which compares an estimate with the truth.
 
@@ -31,6 +31,7 @@ pub mod output;
 pub mod pipeline;
 mod queue;
 pub mod refinement;
+pub mod rig_watch;
 #[cfg(feature = "mcap")]
 pub mod ros;
 pub mod service;

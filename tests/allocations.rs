@@ -167,7 +167,9 @@ mod tests {
     fn method(recording: &Recording) -> Method {
         let rig = recording.rig.clone();
         let (matching, estimation) = (Default::default(), estimation::Settings::default());
-        Method::new(rig, matching, estimation).expect("side by side")
+        Method::new(rig, matching, estimation)
+            .expect("side by side")
+            .watching_rig(&visod::rig_watch::Settings::default())
     }
 
     /// Matching and estimation as they run: what is counted is the estimation's.

@@ -19,8 +19,10 @@ const WINDOW_PX: std::ops::RangeInclusive<i32> = 2..=6;
 /// Turns and least step, px, of the sub-pixel search.
 const SUBPIXEL_TURNS: i32 = 60;
 const SUBPIXEL_STEP_PX: f64 = 1e-4;
-/// Images longer than this are searched at half their size first; corners are then sought in the full image.
-const COARSE_SIDE_PX: u32 = 1024;
+/// No image longer than this is searched: larger ones are reduced, and corners then sought in the full image. A search
+/// takes as the square of the corners that it meets, of which the noise of a large image has thousands: an image without
+/// a board would take half a minute.
+const SEARCHED_SIDE_PX: u32 = 1024;
 
 /// Least and largest area of a circle, px²: OpenCV's own limits suit neither small nor large images.
 const MIN_CIRCLE_PX2: f32 = 10.0;
@@ -87,27 +89,28 @@ fn corners(
         | calib3d::CALIB_CB_FAST_CHECK;
     let mut corners = Vector::<Point2f>::new();
     let mut is_found = false;
-    if side_px > COARSE_SIDE_PX {
-        let mut half = Mat::default();
+    for factor in reductions(side_px) {
+        let mut reduced = Mat::default();
+        let share = 1.0 / f64::from(factor);
+        let size_px = Size::default();
         imgproc::resize(
             image,
-            &mut half,
-            Size::default(),
-            0.5,
-            0.5,
+            &mut reduced,
+            size_px,
+            share,
+            share,
             imgproc::INTER_AREA,
         )?;
-        is_found = calib3d::find_chessboard_corners(&half, size, &mut corners, flags)?;
+        is_found = calib3d::find_chessboard_corners(&reduced, size, &mut corners, flags)?;
         if is_found {
-            // The centre of a pixel of the small image lies between four of the large one.
+            // The centre of a reduced pixel lies in the middle of those that it was made of.
+            let full = |x: f32| factor * x + 0.5 * (factor - 1.0);
             corners = corners
                 .iter()
-                .map(|p| Point2f::new(2.0 * p.x + 0.5, 2.0 * p.y + 0.5))
+                .map(|p| Point2f::new(full(p.x), full(p.y)))
                 .collect();
+            break;
         }
-    }
-    if !is_found {
-        is_found = calib3d::find_chessboard_corners(image, size, &mut corners, flags)?;
     }
     if !is_found || corners.len() != (size.width * size.height) as usize {
         return Ok(None);
@@ -126,6 +129,19 @@ fn corners(
         criteria,
     )?;
     Ok(Some(corners))
+}
+
+/// By what an image is reduced for the search, quickest first.
+fn reductions(side_px: u32) -> impl Iterator<Item = f32> {
+    let mut finest = 1;
+    while side_px / finest > SEARCHED_SIDE_PX {
+        finest *= 2;
+    }
+    let coarser = (finest > 1).then_some(2 * finest);
+    coarser
+        .into_iter()
+        .chain([finest])
+        .map(|factor| factor as f32)
 }
 
 /// Half the window of the sub-pixel search, px.

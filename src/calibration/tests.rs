@@ -127,7 +127,7 @@ fn assert_consistent(lens: Lens, boards: usize) {
     }
     let dof = lens.rig_slots().len();
     let anees = sum / (SEEDS as f64 * dof as f64);
-    let (low, high) = anees_interval(dof, SEEDS as usize, 0.99);
+    let (low, high) = anees_interval(dof, SEEDS as usize, 0.95);
     println!("{lens:?}, {boards} boards: ANEES {anees:.3} in [{low:.3}, {high:.3}]");
     assert!(
         (low..high).contains(&anees),

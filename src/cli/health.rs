@@ -2,9 +2,10 @@
 
 use crate::capture::live::{Snapshot, State};
 use crate::estimation::Status;
-use crate::output::health::{CameraState, HealthMessage};
+use crate::output::health::{CameraState, HealthMessage, RigCondition};
 use crate::output::message::status_code;
 use crate::pipeline::Delivery;
+use crate::rig_watch::RigState;
 use crate::service::budget::FrameBudget;
 use std::time::{Duration, Instant};
 
@@ -63,6 +64,26 @@ impl Health {
         m.pairs_degraded += u64::from(odometry.status == Status::Degraded);
         m.busy_max_ns = m.busy_max_ns.max(ns(busy));
         m.busy_mean_ns = ns(self.busy_total) / m.pairs_processed;
+        if let Some(rig) = &delivery.rig {
+            self.add_rig(rig);
+        }
+    }
+
+    /// Takes note of how the rig is.
+    fn add_rig(&mut self, rig: &RigState) {
+        let condition = if rig.has_moved {
+            RigCondition::Moved
+        } else if rig.misfits {
+            RigCondition::Misfits
+        } else {
+            RigCondition::Good
+        } as u32;
+        let m = &mut self.message;
+        self.changed |= m.rig_state != condition;
+        m.rig_state = condition;
+        // Beyond two radians, which no rig turns by, the cast saturates.
+        [m.rig_pitch_nrad, m.rig_yaw_nrad, m.rig_roll_nrad] =
+            [0, 1, 2].map(|i| (rig.turn_rad[i] * 1e9).round() as i32);
     }
 
     /// Takes note of how the cameras are.

@@ -3,7 +3,7 @@
 use super::attendant::Pulse;
 #[cfg(feature = "ipc")]
 use super::health::Health;
-use super::{Failure, progress};
+use super::{Failure, progress, summary};
 use crate::capture::PairSource;
 use crate::capture::live::{Monitor, Snapshot};
 use crate::config::Config;
@@ -17,6 +17,7 @@ use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
 use crate::pipeline::{self, Delivery, Method, RunFigures, Share, Statistics};
+use crate::rig_watch::RigState;
 use crate::service::budget::{FrameBudget, Timing};
 use indicatif::ProgressBar;
 use std::fs::File;
@@ -46,6 +47,7 @@ pub(crate) struct Session {
     each_row: Option<RowWatcher>,
     live: Option<Live>,
     warned_of_first_order: bool,
+    warned_of_rig: [bool; 2],
 }
 
 /// What there is besides where the pairs come from cameras.
@@ -72,6 +74,8 @@ pub(crate) struct Finished {
     pub(crate) first_unusable: Option<String>,
     /// What became of the cameras, where there were any.
     pub(crate) cameras: Option<Snapshot>,
+    /// How the rig is, where it was watched.
+    pub(crate) rig: Option<RigState>,
 }
 
 impl Session {
@@ -104,6 +108,7 @@ impl Session {
             each_row: None,
             live: None,
             warned_of_first_order: false,
+            warned_of_rig: [false; 2],
         }
     }
 
@@ -186,7 +191,8 @@ impl Session {
         )
         .ok_or_else(|| {
             Failure::usage("the rig's cameras stand behind one another: no depth can be measured")
-        })?;
+        })?
+        .watching_rig(&self.config.rig_watch);
         let share = self.live.as_ref().map(|live| live.share.clone());
         let bound = |extractor| match &share {
             Some(share) => share.bound(extractor),
@@ -218,6 +224,7 @@ impl Session {
                 first_unusable.get_or_insert_with(|| why.to_owned());
             }
             self.warn_of_first_order(&delivery, &bar);
+            self.warn_of_rig(&delivery, &bar);
             last = Some(self.deliver(&delivery, &bar)?);
             bar.inc(1);
             Ok::<_, io::Error>(ControlFlow::Continue(()))
@@ -246,6 +253,7 @@ impl Session {
             publisher.close();
         }
         let cameras = self.live.as_ref().map(|live| live.cameras.snapshot());
+        let rig = method.rig_state();
         let mut figures = statistics.figures();
         figures.counts.dropped = cameras.as_ref().map_or(0, |c| c.dropped);
         Ok(Finished {
@@ -256,6 +264,7 @@ impl Session {
             published: self.published,
             publish_failures: self.publish_failures,
             first_unusable,
+            rig,
         })
     }
 
@@ -278,6 +287,33 @@ impl Session {
                      the covariance does not describe the pose's error any more, that of the motion does"
                 );
             });
+        }
+    }
+
+    /// Says once, of each, that the rig has moved and that it does not belong to the images.
+    fn warn_of_rig(&mut self, delivery: &Delivery<'_>, bar: &ProgressBar) {
+        let Some(rig) = &delivery.rig else {
+            return;
+        };
+        let sequence = delivery.odometry.sequence;
+        let moved = format!(
+            "the cameras have turned against each other, {}",
+            summary::turn_to_text(rig)
+        );
+        let misfits = "left and right images miss each other by more than the rig's uncertainty: calibrate anew, \
+                       or look at it with visod rig check";
+        for (i, (holds, what)) in [(rig.has_moved, moved.as_str()), (rig.misfits, misfits)]
+            .into_iter()
+            .enumerate()
+        {
+            if !holds || std::mem::replace(&mut self.warned_of_rig[i], true) {
+                continue;
+            }
+            if self.live.is_some() {
+                tracing::warn!(sequence, "{what}");
+            } else {
+                bar.suspend(|| eprintln!("visod: warning: at pair {sequence}: {what}"));
+            }
         }
     }
 

@@ -6,6 +6,7 @@ use crate::capture::live::{CameraStatus, Snapshot};
 use crate::evaluation::{self, Trajectory};
 use crate::output::report;
 use crate::output::row::OdometryRow;
+use crate::rig_watch::RigState;
 use std::fmt::Write;
 use std::path::Path;
 
@@ -19,6 +20,8 @@ struct Summary<'a> {
     publish_failures: u64,
     end_position_m: Option<[f64; 3]>,
     end_sigma_m: Option<[f64; 3]>,
+    #[serde(skip_serializing_if = "Option::is_none")]
+    rig: Option<RigState>,
     #[serde(skip_serializing_if = "Option::is_none")]
     cameras: Option<[CameraSummary<'a>; 2]>,
 }
@@ -74,6 +77,30 @@ pub(crate) fn cameras_to_text(cameras: &Snapshot) -> String {
     text
 }
 
+/// How the rig is.
+fn rig_to_text(rig: &RigState) -> String {
+    match (rig.has_moved, rig.misfits) {
+        (true, _) => format!(
+            "the cameras have turned against each other, {}",
+            turn_to_text(rig)
+        ),
+        (_, true) => "the images miss each other by more than its uncertainty".to_owned(),
+        _ => "as calibrated".to_owned(),
+    }
+}
+
+/// By how much the right camera has turned.
+pub(crate) fn turn_to_text(rig: &RigState) -> String {
+    let mrad = |i: usize| {
+        format!(
+            "{:.3} ± {:.3}",
+            rig.turn_rad[i] * 1e3,
+            rig.sigma_rad[i] * 1e3
+        )
+    };
+    format!("pitch {}, yaw {}, roll {} mrad", mrad(0), mrad(1), mrad(2))
+}
+
 /// The summary as JSON.
 pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result<String> {
     serde_json::to_string_pretty(&Summary {
@@ -83,6 +110,7 @@ pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result
         publish_failures: finished.publish_failures,
         end_position_m: finished.last.as_ref().map(position_m),
         end_sigma_m: finished.last.as_ref().map(sigma_m),
+        rig: finished.rig,
         cameras: finished.cameras.as_ref().map(|cameras| {
             let [left, right] = &cameras.cameras;
             [
@@ -123,6 +151,9 @@ pub(crate) fn to_text(finished: &Finished) -> String {
             "  {:<10} median {:>8.2} ms   p99 {:>8.2} ms",
             stage.stage, stage.median, stage.p99
         );
+    }
+    if let Some(rig) = &finished.rig {
+        let _ = writeln!(text, "  rig: {}", rig_to_text(rig));
     }
     if let Some(cameras) = &finished.cameras {
         text += &cameras_to_text(cameras);

@@ -5,7 +5,7 @@
 
 use crate::settings::SettingError;
 use crate::toml_file::{TomlError, TomlText};
-use crate::{capture, estimation, features, matching, output, pipeline, service};
+use crate::{capture, estimation, features, matching, output, pipeline, rig_watch, service};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -27,6 +27,8 @@ pub struct Config {
     pub matching: matching::Settings,
     /// How motion is estimated.
     pub estimation: estimation::Settings,
+    /// How the rig is watched.
+    pub rig_watch: rig_watch::Settings,
     /// How the work is spread over threads.
     pub pipeline: pipeline::Settings,
     /// Where the results are published.
@@ -70,6 +72,7 @@ impl Config {
             ("features", config.features.check()),
             ("matching", config.matching.check()),
             ("estimation", config.estimation.check()),
+            ("rig_watch", config.rig_watch.check()),
             ("pipeline", config.pipeline.check()),
             ("publish", config.publish.check()),
             ("service", config.service.check()),

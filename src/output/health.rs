@@ -44,7 +44,10 @@
 //! | 248 | `u32` | `degraded_mode` | 0 none, 1 fewer features are looked for, since pairs had to wait |
 //! | 252 | `u32` | `features_permille` | share of the features that is looked for, thousandths |
 //! | 256 | `u64` | `overruns` | pairs whose estimate came after the deadline |
-//! | 264 | `[u64; 2]` | `reserved_2` | 0 |
+//! | 264 | `u32` | `rig_state` | see [`RigCondition`] |
+//! | 268 | `i32` | `rig_pitch_nrad` | turn of the right camera since the start, about its x axis, 1e-9 rad |
+//! | 272 | `i32` | `rig_yaw_nrad` | the same, about its y axis |
+//! | 276 | `i32` | `rig_roll_nrad` | the same, about its z axis |
 
 use super::message::{MessageError, check_code, check_header};
 #[cfg(feature = "ipc")]
@@ -72,6 +75,21 @@ pub enum CameraState {
     Stalled = 3,
     /// Gone; it will be opened again when it comes back.
     Lost = 4,
+}
+
+/// Whether the rig is as it was calibrated.
+#[repr(u32)]
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub enum RigCondition {
+    /// Nobody looks.
+    #[default]
+    Unwatched = 0,
+    /// As calibrated, as far as can be told.
+    Good = 1,
+    /// The cameras have turned against each other since the start, beyond doubt.
+    Moved = 2,
+    /// From the start images missed each other by more than the rig's uncertainty.
+    Misfits = 3,
 }
 
 /// How the daemon is, as it lies in shared memory; the module's documentation has the layout.
@@ -121,7 +139,10 @@ pub struct HealthMessage {
     pub degraded_mode: u32,
     pub features_permille: u32,
     pub overruns: u64,
-    pub reserved_2: [u64; 2],
+    pub rig_state: u32,
+    pub rig_pitch_nrad: i32,
+    pub rig_yaw_nrad: i32,
+    pub rig_roll_nrad: i32,
 }
 
 impl Default for HealthMessage {
@@ -165,7 +186,10 @@ impl Default for HealthMessage {
             degraded_mode: 0,
             features_permille: 1000,
             overruns: 0,
-            reserved_2: [0; 2],
+            rig_state: RigCondition::Unwatched as u32,
+            rig_pitch_nrad: 0,
+            rig_yaw_nrad: 0,
+            rig_roll_nrad: 0,
         }
     }
 }
@@ -183,7 +207,8 @@ impl HealthMessage {
         )?;
         check_code("odometry_status", self.odometry_status, 3)?;
         check_code("left_state", self.left_state, CameraState::Lost as u32)?;
-        check_code("right_state", self.right_state, CameraState::Lost as u32)
+        check_code("right_state", self.right_state, CameraState::Lost as u32)?;
+        check_code("rig_state", self.rig_state, RigCondition::Misfits as u32)
     }
 }
 
@@ -202,7 +227,8 @@ mod tests {
             left_lost_in_transport right_lost_in_transport left_unreadable right_unreadable
             left_unmatched right_unmatched pairs_processed pairs_unusable pairs_dropped
             pairs_degraded pairs_lost restarts over_budget publish_failures budget_ns busy_mean_ns
-            busy_max_ns uptime_ns subscribers degraded_mode features_permille overruns reserved_2);
+            busy_max_ns uptime_ns subscribers degraded_mode features_permille overruns
+            rig_state rig_pitch_nrad rig_yaw_nrad rig_roll_nrad);
         let names: Vec<_> = documented.iter().map(|(o, _, f)| (*o, *f)).collect();
         assert_eq!(names, actual);
         assert_gapless(&documented, size_of::<HealthMessage>());

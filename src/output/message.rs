@@ -465,7 +465,7 @@ pub(super) mod tests {
     /// Size of a type named in a layout table, bytes.
     pub(crate) fn size_of_named(kind: &str) -> usize {
         match kind {
-            "u32" => 4,
+            "u32" | "i32" => 4,
             "u64" | "i64" | "f64" => 8,
             other => {
                 let inner = other.trim_matches(['[', ']']);

@@ -15,6 +15,7 @@ use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
 use crate::image::GrayImage;
 use crate::queue::{bounded, prepare_thread};
+use crate::rig_watch::RigState;
 use crate::settings::SettingError;
 use crossbeam_channel::{Receiver, Sender};
 use serde::{Deserialize, Serialize};
@@ -74,6 +75,8 @@ pub struct Delivery<'a> {
     pub unusable: Option<&'a str>,
     /// The images, where there are both.
     pub pair: Option<&'a StereoPair>,
+    /// How the rig is, where it is watched.
+    pub rig: Option<RigState>,
 }
 
 /// Why a run ended early.
@@ -322,6 +325,7 @@ fn collect<E>(
                 latencies: outcome.latencies,
                 unusable: outcome.unusable.as_deref(),
                 pair: outcome.buffers.used.as_ref(),
+                rig: method.rig_state(),
             };
             if deliver(delivery)
                 .map_err(PipelineError::Deliver)?

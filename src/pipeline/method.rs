@@ -15,6 +15,7 @@ use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
 };
 use crate::refinement::{Pyramid, PyramidPair};
+use crate::rig_watch::{self, RigState, RigWatch};
 use nalgebra::{Isometry3, Vector3, Vector4};
 use std::time::{Duration, Instant};
 
@@ -95,6 +96,8 @@ pub(super) struct Workbench {
     pub(super) exposure: Exposure,
     /// When matching was done and estimation began.
     pub(super) matched: Option<Instant>,
+    /// Whether the rig is still as calibrated.
+    pub(super) watch: Option<RigWatch>,
 }
 
 enum Estimator {
@@ -138,12 +141,26 @@ impl Method {
             tracks: Vec::new(),
             odometer: None,
             matched: None,
+            watch: None,
         };
         Some(Self {
             bench,
             estimator,
             times: StageTimes::default(),
         })
+    }
+
+    /// Watches the rig from now on, if the settings want it.
+    #[must_use]
+    pub fn watching_rig(mut self, settings: &rig_watch::Settings) -> Self {
+        self.bench.watch = RigWatch::new(&self.bench.rig, settings, &self.bench.estimation);
+        self
+    }
+
+    /// How the rig is, where it is watched.
+    #[must_use]
+    pub fn rig_state(&self) -> Option<RigState> {
+        self.bench.watch.as_ref().map(RigWatch::state)
     }
 
     /// Takes the next pair and says where the camera is.
@@ -219,6 +236,11 @@ impl Workbench {
                 }
             }
         }
+        if let Some(watch) = &self.watch {
+            for m in measurements.iter_mut() {
+                m.px -= watch.displacement(&m.px);
+            }
+        }
         inverse_depths.clear();
         inverse_depths.extend(
             measurements
@@ -234,6 +256,21 @@ impl Workbench {
         self.odometer
             .as_ref()
             .map_or_else(Exposure::default, |o| o.exposure(skew_s, sigma_s))
+    }
+
+    /// By how much the sight of a point, at about `px`, is displaced by what is known of the exposures' skew and
+    /// of the rig's turn, px.
+    pub(super) fn displacement(
+        &self,
+        px: &Vector4<f64>,
+        now_from_anchor: &Isometry3<f64>,
+        y: Option<&Vector3<f64>>,
+    ) -> Vector4<f64> {
+        let late = y.map_or_else(Vector4::zeros, |y| {
+            self.exposure.displacement(&self.rig, now_from_anchor, y)
+        });
+        let turned = self.watch.as_ref().map(|w| w.displacement(px));
+        late + turned.unwrap_or_else(Vector4::zeros)
     }
 
     /// An odometer that begins with a pair.

@@ -59,6 +59,14 @@ impl TwoFrame {
             return Err(e);
         }
         let measured = self.measure_motion(bench, &odometer, &predicted);
+        if let Some(watch) = &mut bench.watch {
+            watch.begin_sights();
+            for point in &self.points {
+                watch.see(&point.now);
+            }
+            // Corrections hold from the next pair on.
+            let _ = watch.conclude_sights(stamp.timestamp_ns);
+        }
         let counts = bench.counts(measured.as_ref().map_or(0, |m| m.inliers));
         let row = match &measured {
             Some(motion) => odometer.advance(stamp, motion, self.meter.cov_chained(), counts),

@@ -37,6 +37,8 @@ pub(super) struct Windowed {
     spare_images: Vec<Pyramid>,
     next_id: u64,
     seen: Vec<window::Seen>,
+    /// The same, what the right camera saw being unsure.
+    unsure: Vec<window::Seen>,
     weights: Vec<f64>,
     /// Indices of those of `seen` that agree with the motion.
     agreed: Vec<u32>,
@@ -60,6 +62,7 @@ impl Windowed {
             spare_images: vec![blank; settings.keyframes as usize + 1],
             next_id: 0,
             seen: Vec::new(),
+            unsure: Vec::new(),
             weights: Vec::new(),
             agreed: Vec::new(),
             matches: Vec::new(),
@@ -237,11 +240,72 @@ impl Windowed {
             seen.map(|s| 1.0 / f64::from(self.occupancy.count(&s.measurement.left_px()).max(1))),
         );
         let seed = bench.estimation.seed ^ sequence;
-        let newest_from_now =
+        let mut newest_from_now =
             self.window
-                .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed)?;
+                .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
+        if self.watch(bench, newest_from_now.as_ref(), predicted, seed) {
+            newest_from_now =
+                self.window
+                    .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
+        }
+        let newest_from_now = newest_from_now?;
         self.take_note(bench);
         Some(newest_from_now)
+    }
+
+    /// Has the watch on the rig look at the landmarks that agree with a motion. Where none was found, the right
+    /// camera may have turned at once: what it sees is then taken for less sure than it is. Whether `seen` has been
+    /// corrected for a turn that was found.
+    fn watch(
+        &mut self,
+        bench: &mut Workbench,
+        newest_from_now: Option<&Isometry3<f64>>,
+        predicted: &Isometry3<f64>,
+        seed: u64,
+    ) -> bool {
+        let Some(watch) = &mut bench.watch else {
+            return false;
+        };
+        watch.begin_sights();
+        let newest_from_now = newest_from_now.copied().or_else(|| {
+            self.unsure.clear();
+            self.unsure.extend(self.seen.iter().map(|s| {
+                let mut unsure = *s;
+                for sigma_px in unsure.measurement.sigma_px.iter_mut().skip(2) {
+                    *sigma_px = sigma_px.hypot(watch.blow_px());
+                }
+                unsure
+            }));
+            self.window.consent(
+                &self.unsure,
+                &self.weights,
+                predicted,
+                seed,
+                &mut self.agreed,
+            )
+        });
+        let Some(newest_from_now) = newest_from_now else {
+            return false;
+        };
+        let now_from_newest = newest_from_now.inverse();
+        for &i in &self.agreed {
+            let s = &self.seen[i as usize];
+            watch.see(&s.measurement);
+            let expected = self.window.landmark(s.id).and_then(|landmark| {
+                landmark.seen_from(&self.window.newest_from_anchor(landmark)?)
+            });
+            if let Some(expected) = expected {
+                let seen = self.window.corrected(&s.measurement);
+                watch.see_landmark(&now_from_newest, &expected, &seen);
+            }
+        }
+        let Some(more_rad) = watch.conclude_sights(bench.now.pair.timestamp_ns) else {
+            return false;
+        };
+        for s in &mut self.seen {
+            s.measurement.px -= watch.displacement_by(&more_rad, &s.measurement.px);
+        }
+        true
     }
 
     /// Takes note of who agrees with the motion and who does not; only the former stay in `seen`.
@@ -315,7 +379,7 @@ impl Windowed {
             size_px: portrait.size_px,
         };
         let y = &landmark.inverse_depth;
-        let late = bench.exposure.displacement(&bench.rig, &now_from_anchor, y);
+        let late = bench.displacement(start, &now_from_anchor, Some(y));
         let found = refinement::refine(
             &bench.rig,
             &appearance,
@@ -410,10 +474,11 @@ impl Windowed {
     fn meet_one(&mut self, bench: &Workbench, i: usize) -> bool {
         let pair = &bench.now.pair;
         let m = bench.now.matches[i];
-        let late = bench.now.inverse_depths[i].map_or_else(Vector4::zeros, |y| {
-            let exposure = &bench.exposure;
-            exposure.displacement(&bench.rig, &Isometry3::identity(), &y)
-        });
+        let late = bench.displacement(
+            &bench.now.measurements[i].px,
+            &Isometry3::identity(),
+            bench.now.inverse_depths[i].as_ref(),
+        );
         let coarse = &earlier(&bench.now.measurements[i], &-late);
         let size_px = f64::from(pair.left.features.keypoints[m.left as usize].size_px);
         let portrait = Portrait {

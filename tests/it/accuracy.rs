@@ -113,3 +113,23 @@ fn a_rendered_drive_in_full_size_ends_near_the_truth() {
         end * 100.0
     );
 }
+
+#[test]
+fn published_recordings_raise_no_false_alarm_of_the_rig() {
+    for name in ["kitti_straight", "euroc_standstill"] {
+        let Some(recording) = test_recording(name) else {
+            continue;
+        };
+        let output = visod()
+            .args(["replay", "--no-publish", "--json"])
+            .arg(&recording)
+            .output()
+            .unwrap();
+        assert!(output.status.success(), "{}", stderr_of(&output));
+        let summary: Value = serde_json::from_slice(&output.stdout).unwrap();
+        println!("{name}: {}", summary["rig"]);
+        assert_eq!(summary["rig"]["has_moved"], Value::Bool(false), "{name}");
+        assert_eq!(summary["rig"]["misfits"], Value::Bool(false), "{name}");
+        assert!(!stderr_of(&output).contains("turned"), "{name}");
+    }
+}

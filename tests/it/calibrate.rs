@@ -261,6 +261,25 @@ fn good_rigs_raise_no_alarm_with_images_or_without() {
 }
 
 #[test]
+fn the_sample_rig_in_full_size_raises_no_alarm_on_its_own_images() {
+    let rig = Path::new(env!("CARGO_MANIFEST_DIR")).join("config/rig.toml");
+    let rig = rig.to_str().unwrap();
+    let own = tempfile::tempdir().unwrap();
+    let way = "simulate --scene hall --trajectory slalom --frames 3 --rig";
+    let args: Vec<&str> = way.split(' ').chain([rig, "recording"]).collect();
+    succeed(own.path(), &args);
+    let said = succeed(own.path(), &["rig", "check", rig, "--images", "recording"]);
+    assert!(
+        said.contains("plausible") && said.contains("matches agree"),
+        "{said}"
+    );
+    assert!(
+        !said.contains("warning") && !said.contains("error"),
+        "{said}"
+    );
+}
+
+#[test]
 fn images_that_do_not_belong_to_the_rig_are_found() {
     let rigs = good_rigs();
     let Some((_, raw, folder)) = rigs.iter().find(|(name, ..)| *name == "euroc_standstill") else {

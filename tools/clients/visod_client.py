@@ -37,6 +37,7 @@ _EVENT_MAX = 7
 STATUSES = ("initializing", "tracking", "degraded", "lost")
 FRAMES = ("left_camera", "base")
 CAMERA_STATES = ("closed", "opening", "streaming", "stalled", "lost")
+RIG_STATES = ("unwatched", "good", "moved", "misfits")
 BUDGET_PARTS = ("detection", "calibration", "synchronisation", "bridging")
 STAGES = ("capture", "features", "matching", "estimation", "total")
 
@@ -145,7 +146,10 @@ class HealthMessage(ctypes.Structure):
         ("degraded_mode", ctypes.c_uint32),
         ("features_permille", ctypes.c_uint32),
         ("overruns", ctypes.c_uint64),
-        ("reserved_2", ctypes.c_uint64 * 2),
+        ("rig_state", ctypes.c_uint32),
+        ("rig_pitch_nrad", ctypes.c_int32),
+        ("rig_yaw_nrad", ctypes.c_int32),
+        ("rig_roll_nrad", ctypes.c_int32),
     ]
 
     @staticmethod
@@ -283,6 +287,10 @@ class Health:
     degraded_mode: int
     features_permille: int
     overruns: int
+    rig_state: str
+    rig_pitch_nrad: int
+    rig_yaw_nrad: int
+    rig_roll_nrad: int
 
     @staticmethod
     def from_message(m: HealthMessage) -> "Health":
@@ -292,13 +300,15 @@ class Health:
             "message_number", "realtime_ns", "monotonic_ns", "pairs_processed", "pairs_unusable",
             "pairs_dropped", "pairs_degraded", "pairs_lost", "restarts", "over_budget",
             "publish_failures", "busy_mean_ns", "busy_max_ns", "uptime_ns", "subscribers",
-            "degraded_mode", "features_permille", "overruns",
+            "degraded_mode", "features_permille", "overruns", "rig_pitch_nrad", "rig_yaw_nrad",
+            "rig_roll_nrad",
         )  # fmt: skip
         return Health(
             odometry_status=_word(STATUSES, m.odometry_status, "odometry_status"),
             left=_camera(m, "left"),
             right=_camera(m, "right"),
             budget_ns=m.budget_ns or None,
+            rig_state=_word(RIG_STATES, m.rig_state, "rig_state"),
             **{name: getattr(m, name) for name in plain},
         )
 
