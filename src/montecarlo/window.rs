@@ -5,7 +5,7 @@ use crate::estimation::Settings;
 use crate::estimation::sources::{BySources, RigErrors};
 use crate::estimation::window::{Seen, Window};
 use crate::geometry::StereoRig;
-use nalgebra::{Isometry3, Matrix6};
+use nalgebra::{Isometry3, Matrix6, Vector2};
 
 /// The estimator that the pipeline runs, on points instead of images.
 pub struct WindowOdometry {
@@ -49,6 +49,7 @@ impl FrameEstimator for WindowOdometry {
             let seen = Seen {
                 id: s.id,
                 measurement: s.measurement,
+                relief_px: Vector2::zeros(),
             };
             match self.window.landmark(s.id) {
                 Some(_) => self.known.push(seen),

@@ -7,6 +7,7 @@ use super::method::{Described, DescribedPair};
 use crate::estimation::window::LandmarkId;
 use crate::features::{Features, Keypoint};
 use crate::matching::{MatchedPair, StereoMatch};
+use crate::refinement::Slant;
 use nalgebra::Vector2;
 
 /// One landmark's looks, but for its descriptors.
@@ -19,6 +20,8 @@ pub(super) struct Portrait {
     pub(super) px: Vector2<f64>,
     /// Diameter of the keypoint there, px.
     pub(super) size_px: f64,
+    /// What is known of its surface.
+    pub(super) slant: Slant,
     /// Pairs in a row in which it should have been seen and was not.
     pub(super) missed: u32,
     /// Whether the present pair shows it.

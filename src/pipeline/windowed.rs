@@ -10,7 +10,7 @@ use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings, StereoMea
 use crate::geometry::StereoRig;
 use crate::image::GrayImage;
 use crate::matching::MatchError;
-use crate::refinement::{self, Appearance, Pyramid};
+use crate::refinement::{self, Appearance, Pyramid, Refined, Slant};
 use nalgebra::{Isometry3, Vector4};
 use std::time::Instant;
 
@@ -218,7 +218,7 @@ impl Windowed {
             let track = bench.tracks[i];
             let start = bench.now.measurements[track.now as usize].px;
             let gallery_index = track.before as usize;
-            let Some(measurement) = self.seek(
+            let Some(found) = self.seek(
                 bench,
                 gallery_index,
                 &now_from_newest,
@@ -227,11 +227,13 @@ impl Windowed {
             ) else {
                 continue;
             };
-            self.occupancy.enter(&measurement.left_px());
+            self.gallery.portraits[gallery_index].slant = found.slant;
+            self.occupancy.enter(&found.measurement.left_px());
             self.matches.push(i);
             self.seen.push(window::Seen {
                 id: self.gallery.portraits[gallery_index].id,
-                measurement,
+                measurement: found.measurement,
+                relief_px: found.relief_px,
             });
         }
         self.weights.clear();
@@ -347,8 +349,13 @@ impl Windowed {
                 .and_then(|start| self.seek(bench, i, &now_from_newest, &start, REACH_PX));
             let portrait = &mut self.gallery.portraits[i];
             portrait.found = found.is_some();
-            if let Some(measurement) = found {
-                self.seen.push(window::Seen { id, measurement });
+            if let Some(found) = found {
+                portrait.slant = found.slant;
+                self.seen.push(window::Seen {
+                    id,
+                    measurement: found.measurement,
+                    relief_px: found.relief_px,
+                });
             }
         }
         for portrait in &mut self.gallery.portraits {
@@ -368,7 +375,7 @@ impl Windowed {
         now_from_newest: &Isometry3<f64>,
         start: &Vector4<f64>,
         reach_px: f64,
-    ) -> Option<StereoMeasurement> {
+    ) -> Option<Refined> {
         let portrait = &self.gallery.portraits[index];
         let landmark = self.window.landmark(portrait.id)?;
         let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
@@ -377,6 +384,7 @@ impl Windowed {
             image,
             px: portrait.px,
             size_px: portrait.size_px,
+            slant: portrait.slant,
         };
         let y = &landmark.inverse_depth;
         let late = bench.displacement(start, &now_from_anchor, Some(y));
@@ -389,7 +397,10 @@ impl Windowed {
             &(start + late),
             reach_px,
         );
-        found.map(|m| earlier(&m, &late))
+        found.map(|found| Refined {
+            measurement: earlier(&found.measurement, &late),
+            ..found
+        })
     }
 
     /// Whether the window should keep the present pair.
@@ -408,6 +419,7 @@ impl Windowed {
             return;
         };
         let window = &self.window;
+        let focal_px = bench.rig.left.focal_px.x;
         for portrait in &mut self.gallery.portraits {
             // A landmark whose anchor has left the window began anew in this keyframe.
             let Some(landmark) = window.landmark(portrait.id) else {
@@ -416,6 +428,7 @@ impl Windowed {
             if landmark.anchor == newest && portrait.anchor != newest {
                 portrait.anchor = newest;
                 portrait.px = landmark.observations[0].measurement.left_px();
+                portrait.slant = Slant::unknown(focal_px);
             }
         }
         self.gallery.retain(|p| {
@@ -481,11 +494,13 @@ impl Windowed {
         );
         let coarse = &earlier(&bench.now.measurements[i], &-late);
         let size_px = f64::from(pair.left.features.keypoints[m.left as usize].size_px);
-        let portrait = Portrait {
+        let slant = Slant::unknown(bench.rig.left.focal_px.x);
+        let mut portrait = Portrait {
             id: self.next_id,
             anchor: self.window.newest_serial().unwrap_or(0),
             px: coarse.left_px(),
             size_px,
+            slant,
             missed: 0,
             found: true,
             disagreed: false,
@@ -494,17 +509,20 @@ impl Windowed {
             image: &pair.left.pyramid,
             px: portrait.px,
             size_px,
+            slant,
         };
         let right = &pair.right.pyramid;
         let found =
             refinement::refine_right(&bench.rig, &appearance, right, coarse, RIGHT_REACH_PX);
-        let Some(measurement) = found.map(|m| earlier(&m, &late)) else {
+        let Some(found) = found else {
             return false;
         };
+        portrait.slant = found.slant;
         self.next_id += 1;
         self.seen.push(window::Seen {
             id: portrait.id,
-            measurement,
+            measurement: earlier(&found.measurement, &late),
+            relief_px: found.relief_px,
         });
         self.gallery.add(portrait, pair, m);
         true

@@ -2,18 +2,21 @@
 //! same patch out, to a fraction of a pixel and with its covariance.
 //!
 //! A detector places a keypoint in each image anew, with an error of its own each time; a patch
-//! says where *this* surface is. It is warped as a surface that faces the camera would be, and
-//! aligned from coarse to fine; what is reported is the level that determines the position best.
+//! says where *this* surface is. It is warped as its surface, whose slope is learnt on the way, is
+//! seen from elsewhere, and aligned from coarse to fine; what is reported is the level that
+//! determines the position best.
 
 mod patch;
 mod pyramid;
+mod slant;
 
-pub use patch::{Aligned, Template};
+pub use patch::{Aligned, Surface, Template, Warp};
 pub use pyramid::{LEVELS, Pyramid, from_level, to_level};
+pub use slant::Slant;
 
 use crate::estimation::{StereoMeasurement, linearise_sight};
 use crate::geometry::StereoRig;
-use nalgebra::{Isometry3, Matrix2, Vector2, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix2, Matrix4x3, Vector2, Vector3, Vector4};
 
 /// A pair of images, reduced.
 #[derive(Clone, Copy, Debug)]
@@ -33,12 +36,21 @@ pub struct Appearance<'a> {
     pub px: Vector2<f64>,
     /// Diameter of the keypoint, px.
     pub size_px: f64,
+    /// What is known of its surface.
+    pub slant: Slant,
 }
 
 /// A keypoint of this diameter or less is sought on the finest level, px.
 const FINEST_SIZE_PX: f64 = 10.0;
-/// What alignment leaves however good the contrast: interpolation, warp. px of the level.
-const FLOOR_PX: f64 = 0.05;
+/// What alignment leaves however good the contrast, from interpolation: σ, px of the level.
+const FLOOR_PX: f64 = 0.03;
+/// What it leaves of a deformation, relief and edges being no plane: σ, px of the level, of a patch that
+/// is seen at twice or half its size. It stays with the patch from pair to pair.
+const RELIEF_PX: f64 = 0.25;
+/// A patch is made anew where its rim is displaced by a better slope by more, px of the level …
+const MAX_BEND_PX: f64 = 0.3;
+/// … so many times at most.
+const MAX_BENDS: usize = 3;
 /// How far a finer level may move what a coarser one found, px of the finer level.
 const FINER_REACH_PX: f32 = 2.0;
 
@@ -56,32 +68,34 @@ pub fn refine(
     images: &PyramidPair<'_>,
     start: &Vector4<f64>,
     reach_px: f64,
-) -> Option<StereoMeasurement> {
+) -> Option<Refined> {
     let anchor = linearise_sight(rig, &Isometry3::identity(), inverse_depth)?.by_point;
     let now = linearise_sight(rig, now_from_anchor, inverse_depth)?.by_point;
     let by_px: Matrix2<f64> = anchor.fixed_view::<2, 2>(0, 0).try_inverse()?;
-    let mut measurement = StereoMeasurement {
-        px: Vector4::zeros(),
-        sigma_px: Vector4::zeros(),
-    };
+    let by_rays = [*now_from_anchor, rig.right_from_left * now_from_anchor];
+    let mut appearance = *appearance;
+    let (mut px, mut sigma_px) = (Vector4::zeros(), Vector4::zeros());
+    let mut relief_px = Vector2::zeros();
     for (side, image) in [(0, images.left), (2, images.right)] {
-        let warp: Matrix2<f64> = now.fixed_view::<2, 2>(side, 0) * by_px;
+        let view = View::new(&now, side, &by_px, &by_rays[side / 2], inverse_depth);
         let from = Vector2::new(start[side], start[side + 1]);
-        let found = coarse_to_fine(appearance, image, &warp, &from, reach_px)?;
-        measurement
-            .px
-            .fixed_rows_mut::<2>(side)
-            .copy_from(&found.px);
-        measurement
-            .sigma_px
+        let found = coarse_to_fine(&appearance, image, &view, &from, reach_px)?;
+        appearance.slant = found.slant;
+        px.fixed_rows_mut::<2>(side).copy_from(&found.px);
+        sigma_px
             .fixed_rows_mut::<2>(side)
             .copy_from(&found.sigma_px);
+        relief_px[side / 2] = found.relief_px;
     }
-    Some(measurement)
+    Some(Refined {
+        measurement: StereoMeasurement { px, sigma_px },
+        relief_px,
+        slant: appearance.slant,
+    })
 }
 
-/// The stereo measurement of a landmark's patch in its own anchor: the left position is the patch's
-/// centre by definition, and shares the uncertainty that the patch has; the right one is sought.
+/// A landmark's patch in its own anchor: the left position is the patch's centre by definition, and
+/// shares the uncertainty that the patch has; the right one is sought.
 ///
 /// `start` is where the detector saw it. `None` where it is not found on the right.
 #[must_use]
@@ -91,17 +105,67 @@ pub fn refine_right(
     right: &Pyramid,
     start: &StereoMeasurement,
     reach_px: f64,
-) -> Option<StereoMeasurement> {
+) -> Option<Refined> {
     let inverse_depth = crate::estimation::inverse_depth(rig, start)?;
     let by_point = linearise_sight(rig, &Isometry3::identity(), &inverse_depth)?.by_point;
     let by_px: Matrix2<f64> = by_point.fixed_view::<2, 2>(0, 0).try_inverse()?;
-    let warp: Matrix2<f64> = by_point.fixed_view::<2, 2>(2, 0) * by_px;
-    let found = coarse_to_fine(appearance, right, &warp, &start.right_px(), reach_px)?;
+    let view = View::new(&by_point, 2, &by_px, &rig.right_from_left, &inverse_depth);
+    let found = coarse_to_fine(appearance, right, &view, &start.right_px(), reach_px)?;
     let (px, sigma) = (found.px, found.sigma_px);
-    Some(StereoMeasurement {
+    let measurement = StereoMeasurement {
         px: Vector4::new(appearance.px.x, appearance.px.y, px.x, px.y),
         sigma_px: Vector4::new(sigma.x, sigma.y, sigma.x, sigma.y),
+    };
+    Some(Refined {
+        measurement,
+        relief_px: Vector2::new(0.0, found.relief_px),
+        slant: found.slant,
     })
+}
+
+/// How an image shows a patch: the plane that it lies in, through a homography.
+#[derive(Clone, Copy, Debug)]
+pub struct View {
+    /// The derivative of a pixel of the image by the one of the anchor that shows the same, on a
+    /// surface of slope 0.
+    pub now_by_anchor: Matrix2<f64>,
+    /// The displacement against what lies at infinity, px.
+    pub lever_px: Vector2<f64>,
+    /// Share by which depth grows with each px of the anchor, on a surface of slope 0 …
+    pub depth_by_px: Vector2<f64>,
+    /// … and with the slope.
+    pub depth_by_slope: f64,
+}
+
+impl View {
+    /// The camera stands at `now_from_anchor`; from the derivatives of all pixels by (x, y, ρ), those of
+    /// the image from `row` on, and of (x, y) by the anchor's pixel.
+    fn new(
+        by_point: &Matrix4x3<f64>,
+        row: usize,
+        by_px: &Matrix2<f64>,
+        now_from_anchor: &Isometry3<f64>,
+        y: &Vector3<f64>,
+    ) -> Self {
+        let ahead = now_from_anchor.inverse() * Vector3::z();
+        let forward = now_from_anchor.translation.z * y.z;
+        let depth = ahead.dot(&Vector3::new(y.x, y.y, 1.0)) + forward;
+        Self {
+            now_by_anchor: by_point.fixed_view::<2, 2>(row, 0) * by_px,
+            lever_px: by_point.fixed_view::<2, 1>(row, 2) * y.z,
+            depth_by_px: by_px.transpose() * ahead.xy() / depth,
+            depth_by_slope: forward / depth,
+        }
+    }
+
+    /// The derivative of a pixel by the anchor's, and of depth, in shares of it, on a surface of any
+    /// slope.
+    fn on(&self, slope: &Vector2<f64>) -> (Matrix2<f64>, Vector2<f64>) {
+        (
+            self.now_by_anchor + self.lever_px * slope.transpose(),
+            self.depth_by_px + slope * self.depth_by_slope,
+        )
+    }
 }
 
 /// A patch found in one image.
@@ -111,24 +175,85 @@ pub struct Found {
     pub px: Vector2<f64>,
     /// Standard deviations in x and y, px.
     pub sigma_px: Vector2<f64>,
+    /// σ of what does not fit because the surface is no plane, px.
+    pub relief_px: f64,
+    /// What is known of the surface with this image.
+    pub slant: Slant,
 }
 
-/// Finds a patch in `image`, level by level. `now_by_anchor` is the derivative of a pixel of the
-/// image by the one of the anchor that shows the same.
+/// A patch found in both images of a pair.
+#[derive(Clone, Copy, Debug)]
+pub struct Refined {
+    /// Where.
+    pub measurement: StereoMeasurement,
+    /// On the left and on the right, σ of what does not fit because the surface is no plane, px. All
+    /// sights of a patch are off the same way, each in proportion to this.
+    pub relief_px: Vector2<f64>,
+    /// What is known of the surface with this pair.
+    pub slant: Slant,
+}
+
+/// Finds a patch in `image`, level by level.
 #[must_use]
 pub fn coarse_to_fine(
     appearance: &Appearance<'_>,
     image: &Pyramid,
-    now_by_anchor: &Matrix2<f64>,
+    view: &View,
     start: &Vector2<f64>,
     reach_px: f64,
 ) -> Option<Found> {
-    let anchor_by_now = now_by_anchor.try_inverse()?;
-    let magnified = now_by_anchor.determinant().abs();
     let mut best: Option<(Found, f64)> = None;
     let mut at = *start;
+    let mut slope = appearance.slant.slope;
     for level in (0..=coarsest_level(appearance.size_px)).rev() {
         let px = f64::from(1_u32 << level);
+        let reach = match best {
+            None => (reach_px / px) as f32,
+            Some(_) => FINER_REACH_PX,
+        };
+        let Some(found) = on_level(appearance, image, view, (level, reach), &at, slope) else {
+            if best.is_some() {
+                break;
+            }
+            continue;
+        };
+        let var = found
+            .cov
+            .diagonal()
+            .map(|v| (v + FLOOR_PX * FLOOR_PX) * px * px);
+        at = found.at.map(|v| from_level(f64::from(v), level));
+        slope = found.gap;
+        if best.is_none_or(|(_, sum)| var.sum() < sum) {
+            let found = Found {
+                px: at,
+                sigma_px: var.map(f64::sqrt),
+                relief_px: RELIEF_PX * px * deformation(&view.on(&slope).0),
+                slant: appearance.slant.after(slope, found.information),
+            };
+            best = Some((found, var.sum()));
+        }
+    }
+    best.map(|(found, _)| found)
+}
+
+/// Finds a patch on one level, bending it until it fits; the slope itself is left in `gap`.
+fn on_level(
+    appearance: &Appearance<'_>,
+    image: &Pyramid,
+    view: &View,
+    (level, reach): (usize, f32),
+    start: &Vector2<f64>,
+    mut slope: Vector2<f64>,
+) -> Option<Aligned> {
+    let px = f64::from(1_u32 << level);
+    let from = start.map(|v| to_level(v, level) as f32);
+    let mut at = from;
+    for bend in 1.. {
+        let (now_by_anchor, depth_by_px) = view.on(&slope);
+        let magnified = now_by_anchor.determinant();
+        if !(0.1..10.0).contains(&magnified) {
+            return None;
+        }
         // The level of the anchor's image that shows about as much as this one.
         let anchor_level = if magnified > 2.0 {
             level.saturating_sub(1)
@@ -137,37 +262,42 @@ pub fn coarse_to_fine(
         } else {
             level
         };
-        let warp = anchor_by_now * (px / f64::from(1_u32 << anchor_level));
-        let centre = appearance.px.map(|v| to_level(v, anchor_level) as f32);
-        let reach = match best {
-            None => (reach_px / px) as f32,
-            Some(_) => FINER_REACH_PX,
+        let spread = now_by_anchor.try_inverse()? * px;
+        let surface = Surface {
+            lever: view.lever_px / px,
+            spread,
+            gap: appearance.slant.slope - slope,
+            information: appearance.slant.information,
         };
-        let from = at.map(|v| to_level(v, level) as f32);
-        let found = Template::new(
+        let warp = Warp {
+            linear: (spread / f64::from(1_u32 << anchor_level)).map(|v| v as f32),
+            depth: (spread.transpose() * depth_by_px).map(|v| v as f32),
+        };
+        let centre = appearance.px.map(|v| to_level(v, anchor_level) as f32);
+        let template = Template::new(
             appearance.image.level(anchor_level),
             &centre,
-            &warp.map(|v| v as f32),
-        )
-        .and_then(|template| template.align(image.level(level), &from, reach.max(1.0)));
-        let Some(found) = found else {
-            if best.is_some() {
-                break;
-            }
-            continue;
-        };
-        let var = Vector2::new(found.cov[(0, 0)], found.cov[(1, 1)])
-            .map(|v| (f64::from(v) + FLOOR_PX * FLOOR_PX) * px * px);
-        at = found.at.map(|v| from_level(f64::from(v), level));
-        if best.is_none_or(|(_, sum)| var.sum() < sum) {
-            let found = Found {
-                px: at,
-                sigma_px: var.map(f64::sqrt),
-            };
-            best = Some((found, var.sum()));
+            &warp,
+            &surface,
+        )?;
+        let mut found = template.align(image.level(level), &at, reach.max(1.0))?;
+        if (found.at - from).amax() > reach.max(1.0) {
+            return None;
         }
+        let bent_px =
+            surface.lever.norm() * (spread.transpose() * found.gap).norm() * patch::HALF as f64;
+        found.gap += slope;
+        if bent_px < MAX_BEND_PX || bend == MAX_BENDS {
+            return Some(found);
+        }
+        (slope, at) = (found.gap, found.at);
     }
-    best.map(|(found, _)| found)
+    None
+}
+
+/// How far a derivative is from a rotation: the root of the sum of its principal strains' squares.
+fn deformation(now_by_anchor: &Matrix2<f64>) -> f64 {
+    0.5 * (now_by_anchor.transpose() * now_by_anchor - Matrix2::identity()).norm()
 }
 
 fn coarsest_level(size_px: f64) -> usize {

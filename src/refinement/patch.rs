@@ -2,17 +2,23 @@
 //! its covariance.
 //!
 //! Inverse compositional alignment (Baker & Matthews 2004) of a translation, brightness and
-//! contrast free: gradients are the template's, so that their normal equations are solved once.
+//! contrast free: gradients are the template's, so that their normal equations are solved once. The
+//! surface's slope is estimated along with the translation, by what is known of it before; a
+//! translation that stands for a slope would be off.
 
 use crate::image::GrayImage;
-use nalgebra::{Matrix2, Vector2};
+use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 /// Half the side of a patch, samples.
-const HALF: usize = 5;
+pub(super) const HALF: usize = 5;
 /// Samples a side.
 const SIDE: usize = 2 * HALF + 1;
 /// Samples of a patch.
 const AREA: usize = SIDE * SIDE;
+/// Floats that hold them, zeros at the end: a multiple of what registers hold.
+const ROOM: usize = AREA.next_multiple_of(LANES);
+/// Sums that run side by side.
+const LANES: usize = 8;
 /// A side of the template with the rim that its gradients need.
 const RIM_SIDE: usize = SIDE + 2;
 /// Room that a patch needs around its centre in the target, px of the level.
@@ -21,29 +27,59 @@ const MARGIN: f32 = HALF as f32 + 1.0;
 /// Iterations at most.
 const MAX_ITERATIONS: usize = 12;
 /// A step that ends the alignment, px of the level.
-const MIN_STEP: f32 = 0.003;
+const MIN_STEP: f64 = 0.003;
 /// Weakest contrast of a template, grey levels (standard deviation).
 const MIN_CONTRAST: f32 = 2.0;
 /// Least correlation of what was found with the template.
-const MIN_CORRELATION: f32 = 0.8;
-/// Neighbouring samples share their deviations, what smoothing and interpolation did to the image's
-/// noise and what a warp that is not quite right does: so many count as one.
-const SHARED: f32 = 4.0;
+const MIN_CORRELATION: f32 = 0.9;
+/// Neighbouring samples share their deviations, as smoothing and interpolation do with the image's
+/// noise: so many count as one.
+const SHARED: f64 = 4.5;
 /// Rounding to whole grey levels, once in each image: variance 1/12 each, less what smoothing takes.
-const ROUNDING_VARIANCE: f32 = 0.1;
+const ROUNDING_VARIANCE: f64 = 0.1;
+/// Variance of a sample, shared, before the alignment tells, grey levels².
+const USUAL_VARIANCE: f64 = 4.0;
+
+/// Samples of a patch.
+type Samples = [f32; ROOM];
+
+/// How a template depends on its surface's slope.
+#[derive(Clone, Copy, Debug)]
+pub struct Surface {
+    /// The patch's displacement against what lies at infinity, px of the target's level.
+    pub lever: Vector2<f64>,
+    /// Maps an offset in px of the target's level into the px in which the slope counts.
+    pub spread: Matrix2<f64>,
+    /// What is known of the slope: how far it is from the one that the template is made with.
+    pub gap: Vector2<f64>,
+    /// Its information.
+    pub information: Matrix2<f64>,
+}
+
+/// Maps an offset from the patch's centre in the target's level into the image that the template is
+/// sampled from: a homography that keeps the centre, `linear · q / (1 − depth · q)`.
+#[derive(Clone, Copy, Debug)]
+pub struct Warp {
+    /// The derivative at the centre.
+    pub linear: Matrix2<f32>,
+    /// Share by which depth grows with each px of the target's level.
+    pub depth: Vector2<f32>,
+}
 
 /// What a point looks like, ready for alignment.
 #[derive(Clone, Debug)]
 pub struct Template {
     /// Grey values less their mean.
-    values: [f32; AREA],
-    /// Gradients, less what brightness and contrast would explain, per px of the target's level.
-    by_x: [f32; AREA],
-    by_y: [f32; AREA],
+    values: Samples,
+    /// Derivatives, less what brightness and contrast would explain, by place (per px of the target's
+    /// level) and by slope.
+    by: [Samples; 4],
     /// Sum of squared values.
     energy: f32,
-    /// Inverse of the gradients' normal equations.
-    inverse: Matrix2<f32>,
+    /// The derivatives' normal equations.
+    normal: Matrix4<f64>,
+    /// What is known of the slope: information, and that times the gap.
+    known: (Matrix4<f64>, Vector4<f64>),
 }
 
 /// Where a template was found.
@@ -52,74 +88,108 @@ pub struct Aligned {
     /// Position, px of the level.
     pub at: Vector2<f32>,
     /// Covariance of one image's share in it, px² of the level.
-    pub cov: Matrix2<f32>,
+    pub cov: Matrix2<f64>,
+    /// How far the slope is from the one that the template is made with.
+    pub gap: Vector2<f64>,
+    /// Its information.
+    pub information: Matrix2<f64>,
     /// Correlation of target and template, −1 to 1.
     pub correlation: f32,
 }
 
 impl Template {
     /// The surroundings of `centre` in `image`, sampled where a square grid of the target's pixels
-    /// falls: `warp` maps a px of the target's level into px of `image`.
+    /// falls.
     ///
     /// `None` where they leave the image, or are too flat to be found again.
     #[must_use]
-    pub fn new(image: &GrayImage, centre: &Vector2<f32>, warp: &Matrix2<f32>) -> Option<Self> {
+    pub fn new(
+        image: &GrayImage,
+        centre: &Vector2<f32>,
+        warp: &Warp,
+        surface: &Surface,
+    ) -> Option<Self> {
         let mut wide = [0.0_f32; RIM_SIDE * RIM_SIDE];
         let reach = (HALF + 1) as f32;
+        let nearest = 1.0 - reach * warp.depth.abs().sum();
+        if nearest < 0.5 {
+            return None;
+        }
+        let linear = &warp.linear;
         let extent = Vector2::new(
-            warp[(0, 0)].abs() + warp[(0, 1)].abs(),
-            warp[(1, 0)].abs() + warp[(1, 1)].abs(),
-        ) * reach;
+            linear[(0, 0)].abs() + linear[(0, 1)].abs(),
+            linear[(1, 0)].abs() + linear[(1, 1)].abs(),
+        ) * (reach / nearest);
         if !holds(image, centre, &extent) {
             return None;
         }
         for row in 0..RIM_SIDE {
             for column in 0..RIM_SIDE {
                 let grid = Vector2::new(column as f32 - reach, row as f32 - reach);
-                wide[row * RIM_SIDE + column] = sample(image, &(centre + warp * grid));
+                wide[row * RIM_SIDE + column] = sample(
+                    image,
+                    &(centre + linear * grid / (1.0 - warp.depth.dot(&grid))),
+                );
             }
         }
-        Self::from_samples(&wide)
+        Self::from_samples(&wide, surface)
     }
 
-    fn from_samples(wide: &[f32; RIM_SIDE * RIM_SIDE]) -> Option<Self> {
-        let mut template = Self {
-            values: [0.0; AREA],
-            by_x: [0.0; AREA],
-            by_y: [0.0; AREA],
-            energy: 0.0,
-            inverse: Matrix2::zeros(),
-        };
+    fn from_samples(wide: &[f32; RIM_SIDE * RIM_SIDE], surface: &Surface) -> Option<Self> {
+        let mut values = [0.0; ROOM];
+        let mut by = [[0.0; ROOM]; 4];
+        let lever = surface.lever.map(|v| v as f32);
+        let spread = surface.spread.map(|v| v as f32);
         for row in 0..SIDE {
             for column in 0..SIDE {
                 let at = (row + 1) * RIM_SIDE + column + 1;
                 let i = row * SIDE + column;
-                template.values[i] = wide[at];
-                template.by_x[i] = 0.5 * (wide[at + 1] - wide[at - 1]);
-                template.by_y[i] = 0.5 * (wide[at + RIM_SIDE] - wide[at - RIM_SIDE]);
+                values[i] = wide[at];
+                let by_x = 0.5 * (wide[at + 1] - wide[at - 1]);
+                let by_y = 0.5 * (wide[at + RIM_SIDE] - wide[at - RIM_SIDE]);
+                let (x, y) = (column as f32 - HALF as f32, row as f32 - HALF as f32);
+                let along = -(by_x * lever.x + by_y * lever.y);
+                by[0][i] = by_x;
+                by[1][i] = by_y;
+                by[2][i] = along * (spread[(0, 0)] * x + spread[(0, 1)] * y);
+                by[3][i] = along * (spread[(1, 0)] * x + spread[(1, 1)] * y);
             }
         }
-        centre_on_zero(&mut template.values);
-        template.energy = dot(&template.values, &template.values);
-        if template.energy < MIN_CONTRAST * MIN_CONTRAST * AREA as f32 {
+        centre_on_zero(&mut values);
+        let energy = dot(&values, &values);
+        if energy < MIN_CONTRAST * MIN_CONTRAST * AREA as f32 {
             return None;
         }
-        for gradient in [&mut template.by_x, &mut template.by_y] {
-            centre_on_zero(gradient);
-            let share = dot(gradient, &template.values) / template.energy;
-            for (g, v) in gradient.iter_mut().zip(&template.values) {
-                *g -= share * v;
+        for derivative in &mut by {
+            centre_on_zero(derivative);
+            let share = dot(derivative, &values) / energy;
+            for (d, v) in derivative.iter_mut().zip(&values) {
+                *d -= share * v;
             }
         }
-        let normal = Matrix2::new(
-            dot(&template.by_x, &template.by_x),
-            dot(&template.by_x, &template.by_y),
-            dot(&template.by_x, &template.by_y),
-            dot(&template.by_y, &template.by_y),
-        );
-        template.inverse = normal.try_inverse()?;
-        let positive = template.inverse[(0, 0)] > 0.0 && template.inverse[(1, 1)] > 0.0;
-        positive.then_some(template)
+        let mut normal = Matrix4::zeros();
+        for row in 0..4 {
+            for column in row..4 {
+                let sum = f64::from(dot(&by[row], &by[column]));
+                normal[(row, column)] = sum;
+                normal[(column, row)] = sum;
+            }
+        }
+        let mut information = Matrix4::zeros();
+        information
+            .fixed_view_mut::<2, 2>(2, 2)
+            .copy_from(&surface.information);
+        let mut towards = Vector4::zeros();
+        towards
+            .fixed_rows_mut::<2>(2)
+            .copy_from(&(surface.information * surface.gap));
+        Some(Self {
+            values,
+            by,
+            energy,
+            normal,
+            known: (information, towards),
+        })
     }
 
     /// Finds the template in `image`, starting at `start` and at most `reach` px away from there.
@@ -128,8 +198,11 @@ impl Template {
     /// that looks different.
     #[must_use]
     pub fn align(&self, image: &GrayImage, start: &Vector2<f32>, reach: f32) -> Option<Aligned> {
+        let inverse = (self.normal + self.known.0 * USUAL_VARIANCE)
+            .cholesky()?
+            .inverse();
         let mut at = *start;
-        let mut seen = [0.0_f32; AREA];
+        let mut seen = [0.0; ROOM];
         for _ in 0..MAX_ITERATIONS {
             if !holds(image, &at, &Vector2::repeat(MARGIN)) || (at - start).amax() > reach {
                 return None;
@@ -140,39 +213,46 @@ impl Template {
             if gain <= 0.1 {
                 return None;
             }
-            let mut gradient = Vector2::zeros();
-            let gradients = self.by_x.iter().zip(&self.by_y);
-            for ((s, v), (x, y)) in seen.iter().zip(&self.values).zip(gradients) {
-                let e = s / gain - v;
-                gradient.x += e * x;
-                gradient.y += e * y;
+            let energy = dot(&seen, &seen);
+            for (s, v) in seen.iter_mut().zip(&self.values) {
+                *s = *s / gain - v;
             }
-            let step = self.inverse * gradient;
-            if step.amax() < MIN_STEP {
-                return self.judge(at - step, &seen, gain);
+            let gradient = Vector4::from(self.by.each_ref().map(|by| f64::from(dot(by, &seen))));
+            let step = inverse * (gradient + self.known.1 * USUAL_VARIANCE);
+            if step.xy().amax() < MIN_STEP {
+                let correlation = gain * (self.energy / energy).sqrt();
+                return self.judge(at, &seen, &gradient, &step, correlation);
             }
-            at -= step;
+            at -= step.xy().map(|v| v as f32);
         }
         None
     }
 
-    fn judge(&self, at: Vector2<f32>, seen: &[f32; AREA], gain: f32) -> Option<Aligned> {
-        let seen_energy = dot(seen, seen);
-        let correlation = gain * (self.energy / seen_energy).sqrt();
+    /// What an alignment came to that left `misfit`, whose products with the derivatives are
+    /// `gradient`, and that `step` would end.
+    fn judge(
+        &self,
+        at: Vector2<f32>,
+        misfit: &Samples,
+        gradient: &Vector4<f64>,
+        step: &Vector4<f64>,
+        correlation: f32,
+    ) -> Option<Aligned> {
         if correlation.is_nan() || correlation < MIN_CORRELATION {
             return None;
         }
-        let mut misfit = 0.0;
-        for (s, v) in seen.iter().zip(&self.values) {
-            let e = s / gain - v;
-            misfit += e * e;
-        }
-        // Four parameters were fitted; template and target have half of the misfit each.
-        let variance = misfit / (AREA - 4) as f32;
+        let explained = 2.0 * step.dot(gradient) - step.dot(&(self.normal * step));
+        let left = (f64::from(dot(misfit, misfit)) - explained).max(0.0);
+        // Six parameters were fitted; template and target have half of the misfit each.
+        let variance = left / (AREA - 6) as f64;
         let share = SHARED * (0.5 * variance + ROUNDING_VARIANCE);
+        let cov = (self.normal / share + self.known.0).cholesky()?.inverse();
+        let step = cov * (gradient / share + self.known.1);
         Some(Aligned {
-            at,
-            cov: self.inverse * share,
+            at: at - step.xy().map(|v| v as f32),
+            cov: cov.fixed_view::<2, 2>(0, 0).into_owned(),
+            gap: step.fixed_rows::<2>(2).into_owned(),
+            information: cov.fixed_view::<2, 2>(2, 2).try_inverse()?,
             correlation,
         })
     }
@@ -197,7 +277,7 @@ fn sample(image: &GrayImage, at: &Vector2<f32>) -> f32 {
 }
 
 /// The square of pixels around `at`, bilinear: all share their weights.
-fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut [f32; AREA]) {
+fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut Samples) {
     let (x, y) = (at.x.floor(), at.y.floor());
     let (fx, fy) = (at.x - x, at.y - y);
     let weights = [
@@ -208,7 +288,7 @@ fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut [f32; AREA]) {
     ];
     let (left, top) = (x as usize - HALF, y as u32 - HALF as u32);
     let mut above = &image.row(top)[left..][..SIDE + 1];
-    for (row, out) in (1..).zip(out.chunks_exact_mut(SIDE)) {
+    for (row, out) in (1..).zip(out[..AREA].chunks_exact_mut(SIDE)) {
         let below = &image.row(top + row)[left..][..SIDE + 1];
         for (i, o) in out.iter_mut().enumerate() {
             *o = weights[0] * f32::from(above[i])
@@ -220,15 +300,28 @@ fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut [f32; AREA]) {
     }
 }
 
-fn centre_on_zero(values: &mut [f32; AREA]) {
-    let mean = values.iter().sum::<f32>() / AREA as f32;
-    for v in values {
+fn centre_on_zero(values: &mut Samples) {
+    let mut sums = [0.0; LANES];
+    for values in values.as_chunks::<LANES>().0 {
+        for (sum, v) in sums.iter_mut().zip(values) {
+            *sum += v;
+        }
+    }
+    let mean = sums.iter().sum::<f32>() / AREA as f32;
+    for v in &mut values[..AREA] {
         *v -= mean;
     }
 }
 
-fn dot(a: &[f32; AREA], b: &[f32; AREA]) -> f32 {
-    a.iter().zip(b).map(|(a, b)| a * b).sum()
+fn dot(a: &Samples, b: &Samples) -> f32 {
+    let mut sums = [0.0; LANES];
+    let (a, b) = (a.as_chunks::<LANES>().0, b.as_chunks::<LANES>().0);
+    for (a, b) in a.iter().zip(b) {
+        for ((sum, a), b) in sums.iter_mut().zip(a).zip(b) {
+            *sum += a * b;
+        }
+    }
+    sums.iter().sum()
 }
 
 #[cfg(test)]
@@ -238,6 +331,21 @@ mod tests {
     use rand::SeedableRng;
     use rand_distr::{Distribution, StandardNormal};
     use rand_xoshiro::Xoshiro256PlusPlus;
+
+    /// A surface that is known to face the camera.
+    const FACING: Surface = Surface {
+        lever: Vector2::new(1.0, 0.0),
+        spread: Matrix2::new(1.0, 0.0, 0.0, 1.0),
+        gap: Vector2::new(0.0, 0.0),
+        information: Matrix2::new(1e12, 0.0, 0.0, 1e12),
+    };
+
+    fn affine(warp: &Matrix2<f64>) -> Warp {
+        Warp {
+            linear: warp.map(|v| v as f32),
+            depth: Vector2::zeros(),
+        }
+    }
 
     /// A smooth texture; `at` in px of the template's image.
     fn texture(at: Vector2<f64>) -> f64 {
@@ -277,7 +385,7 @@ mod tests {
 
     fn find(seen: &GrayImage, first: &GrayImage, warp: &Matrix2<f64>) -> Option<Aligned> {
         let centre = Vector2::new(31.3, 30.6);
-        let template = Template::new(first, &centre, &warp.map(|v| v as f32))?;
+        let template = Template::new(first, &centre, &affine(warp), &FACING)?;
         template.align(seen, &Vector2::new(30.0, 32.0), 4.0)
     }
 
@@ -318,7 +426,7 @@ mod tests {
                 squares += error.component_mul(&error) / RUNS as f64;
                 // Template and target have one share each; the floor stands for interpolation.
                 let floor = Vector2::repeat(FLOOR_PX * FLOOR_PX);
-                stated += 2.0 * (found.cov.diagonal().cast::<f64>() + floor) / RUNS as f64;
+                stated += 2.0 * (found.cov.diagonal() + floor) / RUNS as f64;
             }
             for axis in 0..2 {
                 let ratio = squares[axis] / stated[axis];
@@ -327,17 +435,75 @@ mod tests {
         }
     }
 
+    /// A surface whose slope nobody knows, seen with so much parallax.
+    fn sloping(lever: Vector2<f64>, gap: Vector2<f64>) -> Surface {
+        Surface {
+            lever,
+            spread: Matrix2::identity(),
+            gap,
+            information: Matrix2::identity() / (0.1 * 0.1),
+        }
+    }
+
+    #[test]
+    fn the_slope_is_found_and_does_not_draw_the_place_along() {
+        const RUNS: usize = 100;
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(4);
+        let identity = Matrix2::identity();
+        let (lever, slope) = (Vector2::new(9.0, 3.0), Vector2::new(0.006, -0.005));
+        let centre = Vector2::new(31.3, 30.6);
+        let truth = Vector2::new(30.4, 31.2);
+        let bent = (identity + lever * slope.transpose())
+            .try_inverse()
+            .expect("regular");
+        let offset = centre - bent * truth;
+        let known = Surface {
+            information: FACING.information,
+            ..sloping(lever, Vector2::zeros())
+        };
+        let (mut of_place, mut of_slope) = (0.0, 0.0);
+        let (mut mean, mut mean_facing) = (Vector2::zeros(), Vector2::zeros());
+        for _ in 0..RUNS {
+            let first = image(&identity, &Vector2::zeros(), 1.0, 3.0, &mut rng);
+            let seen = image(&bent, &offset, 1.0, 3.0, &mut rng);
+            let find_on = |surface: &Surface| {
+                let at = centre.map(|v: f64| v as f32);
+                let template = Template::new(&first, &at, &affine(&identity), surface)?;
+                template.align(&seen, &Vector2::new(30.0, 32.0), 4.0)
+            };
+            let found = find_on(&sloping(lever, Vector2::zeros())).expect("plain to see");
+            let error = found.at.cast::<f64>() - truth;
+            // Template and target have one share each.
+            let cov = 2.0 * found.cov + Matrix2::identity() * (2.0 * FLOOR_PX * FLOOR_PX);
+            let inverse = cov.try_inverse().expect("regular");
+            of_place += error.dot(&(inverse * error)) / (2 * RUNS) as f64;
+            let gap = found.gap - slope;
+            of_slope += gap.dot(&(found.information * gap)) / (2 * RUNS) as f64;
+            mean += error / RUNS as f64;
+            let facing = find_on(&known).expect("plain to see");
+            mean_facing += (facing.at.cast::<f64>() - truth) / RUNS as f64;
+        }
+        assert!((0.3..1.3).contains(&of_place), "{of_place}");
+        // The template's own noise makes slopes come out a little too small.
+        assert!((0.2..2.2).contains(&of_slope), "{of_slope}");
+        assert!(mean_facing.norm() > 0.03, "{mean_facing}");
+        assert!(
+            mean.norm() < 0.4 * mean_facing.norm(),
+            "{mean} {mean_facing}"
+        );
+    }
+
     #[test]
     fn what_is_flat_different_or_out_of_reach_is_refused() {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(3);
         let identity = Matrix2::identity();
-        let warp = Matrix2::identity();
+        let warp = affine(&identity);
         let first = image(&identity, &Vector2::zeros(), 1.0, 0.0, &mut rng);
         let centre = Vector2::new(31.0, 31.0);
         let flat = GrayImage::filled(64, 64, 90);
-        assert!(Template::new(&flat, &centre, &warp).is_none());
-        assert!(Template::new(&first, &Vector2::new(3.0, 31.0), &warp).is_none());
-        let template = Template::new(&first, &centre, &warp).expect("textured");
+        assert!(Template::new(&flat, &centre, &warp, &FACING).is_none());
+        assert!(Template::new(&first, &Vector2::new(3.0, 31.0), &warp, &FACING).is_none());
+        let template = Template::new(&first, &centre, &warp, &FACING).expect("textured");
         assert!(template.align(&flat, &centre, 4.0).is_none());
         let elsewhere = image(&identity, &Vector2::new(1000.0, 2000.0), 1.0, 0.0, &mut rng);
         assert!(template.align(&elsewhere, &centre, 4.0).is_none());

@@ -7,7 +7,7 @@ use super::warp::WARP;
 use super::{Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Window, row_of};
 use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::se3;
-use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, Vector6};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, Vector2, Vector6};
 
 impl Window {
     /// Makes the newest frame a keyframe, `new` what it sees for the first time. Where the window
@@ -26,8 +26,7 @@ impl Window {
             let met = Landmark::new(&self.rig, s.id, newest, s.measurement, &calibrated);
             if let Some(landmark) = met {
                 let sights = self.spare_sights.pop().unwrap_or_else(room_for_sights);
-                self.landmarks
-                    .push(landmark.with_first_sight(sights, s.measurement));
+                self.landmarks.push(landmark.with_first_sight(sights, s));
             }
         }
         // An id may come back after its landmark was given up.
@@ -231,7 +230,12 @@ impl Window {
             });
             match (anew, last) {
                 (Some(anew), Some(last)) => {
-                    *landmark = anew.with_first_sight(sights, last.measurement);
+                    let first = Seen {
+                        id: landmark.id,
+                        measurement: last.measurement,
+                        relief_px: Vector2::zeros(),
+                    };
+                    *landmark = anew.with_first_sight(sights, &first);
                     true
                 }
                 _ => {

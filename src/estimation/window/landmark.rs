@@ -1,8 +1,9 @@
 //! A landmark: a point that stays where it is, with what saw it.
 
 use super::super::{StereoMeasurement, sight};
+use super::Seen;
 use crate::geometry::StereoRig;
-use nalgebra::{Isometry3, Matrix3, Matrix4, Vector3};
+use nalgebra::{Isometry3, Matrix3, Matrix4, Vector2, Vector3, Vector4};
 
 /// Names a landmark for as long as it is tracked; later ones are larger.
 pub type LandmarkId = u64;
@@ -14,6 +15,21 @@ pub struct Observation {
     pub serial: u64,
     /// Where it was seen.
     pub measurement: StereoMeasurement,
+    /// How much of the landmark's relief is in that, on the left and on the right, px.
+    pub relief_px: Vector2<f64>,
+}
+
+impl Observation {
+    /// What the landmark's relief does to the sight, px.
+    pub(super) fn by_relief(&self, relief: &Vector2<f64>) -> Vector4<f64> {
+        let [left, right] = self.relief_px.into();
+        Vector4::new(
+            left * relief.x,
+            left * relief.y,
+            right * relief.x,
+            right * relief.y,
+        )
+    }
 }
 
 /// A point in inverse depth in the left camera of the keyframe that first saw it, its *anchor*.
@@ -25,6 +41,11 @@ pub struct Landmark {
     pub anchor: u64,
     /// (x, y, ρ): the point is (x, y, 1) / ρ in the anchor's left camera.
     pub inverse_depth: Vector3<f64>,
+    /// By how much its sights are off in x and y because its surface is no plane: σ is 1, its unit what
+    /// each sight's `relief_px` says.
+    pub relief: Vector2<f64>,
+    /// How many unknowns its sights settle: three, and as much of the relief as they tell.
+    pub(super) settled: f64,
     /// Covariance of (x, y, ρ), the poses being given.
     pub cov: Matrix3<f64>,
     /// What saw it, the anchor first, in the order of time.
@@ -54,6 +75,8 @@ impl Landmark {
             id,
             anchor,
             inverse_depth,
+            relief: Vector2::zeros(),
+            settled: 3.0,
             cov,
             observations: Vec::new(),
             wrong: 0,
@@ -61,25 +84,23 @@ impl Landmark {
     }
 
     /// The landmark with what its anchor saw as the only sight in `sights`, whose memory is used again.
-    pub(super) fn with_first_sight(
-        mut self,
-        mut sights: Vec<Observation>,
-        measurement: StereoMeasurement,
-    ) -> Self {
+    pub(super) fn with_first_sight(mut self, mut sights: Vec<Observation>, first: &Seen) -> Self {
         sights.clear();
         sights.push(Observation {
             serial: self.anchor,
-            measurement,
+            measurement: first.measurement,
+            relief_px: first.relief_px,
         });
         self.observations = sights;
         self
     }
 
     /// Takes note of one more sight.
-    pub(super) fn observe(&mut self, serial: u64, measurement: StereoMeasurement) {
+    pub(super) fn observe(&mut self, serial: u64, seen: &Seen) {
         self.observations.push(Observation {
             serial,
-            measurement,
+            measurement: seen.measurement,
+            relief_px: seen.relief_px,
         });
     }
 

@@ -123,8 +123,9 @@ impl VarianceFactor {
     }
 }
 
-/// However small residuals are, no more than this is believed of the stated σ: half of it.
-const MIN_VARIANCE_FACTOR: f64 = 0.25;
+/// However small residuals are, no less than this is believed of the stated variance: what stays with a
+/// patch from pair to pair is not in them.
+const MIN_VARIANCE_FACTOR: f64 = 0.4;
 
 impl Window {
     /// An empty window, to be [begun](Self::begin_at).
@@ -306,4 +307,7 @@ pub struct Seen {
     pub id: LandmarkId,
     /// Where.
     pub measurement: StereoMeasurement,
+    /// On the left and on the right, σ of an error that all sights of the landmark share, each in
+    /// proportion to this, px.
+    pub relief_px: Vector2<f64>,
 }

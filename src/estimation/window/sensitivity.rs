@@ -11,7 +11,7 @@ use super::super::sources::{MODE_COLUMNS, MODES, RigErrors, SKEW_COLUMN};
 use super::landmark::Landmark;
 use super::memory::UnknownsBySources;
 use super::row_of;
-use super::system::{At, System, weigh};
+use super::system::{self, At, POINT, System, weigh};
 use super::warp::WARP;
 use crate::geometry::product::{product, transposed_product};
 use nalgebra::SMatrix;
@@ -54,7 +54,7 @@ impl Sensitivity {
             let Some(anchor) = at.frames.iter().position(|f| f.serial == landmark.anchor) else {
                 continue;
             };
-            let mut by_point = SMatrix::<f64, 3, MOVING>::zeros();
+            let mut by_point = SMatrix::<f64, POINT, MOVING>::zeros();
             for observation in &landmark.observations {
                 if Some(observation.serial) == at.without {
                     continue;
@@ -78,7 +78,9 @@ impl Sensitivity {
                 let Some(displaced) = displacement(at, errors, frame, from, y) else {
                     continue;
                 };
-                let residual = at.warp.corrected(&observation.measurement).px - px;
+                let residual = at.warp.corrected(&observation.measurement).px
+                    - px
+                    - observation.by_relief(&landmark.relief);
                 let (info, _, _) = weigh(
                     &residual,
                     &observation.measurement.sigma_px,
@@ -88,7 +90,7 @@ impl Sensitivity {
                 for i in 0..4 {
                     weighted.row_mut(i).scale_mut(info[i]);
                 }
-                by_point += transposed_product(&seen.by_point, &weighted);
+                by_point += transposed_product(&system::by_point(&seen, observation), &weighted);
                 let by_warp = at.warp.derivative(&observation.measurement);
                 warp += by_warp.transpose() * weighted.fixed_rows::<2>(2);
                 if frame != anchor {

@@ -12,7 +12,9 @@ use super::warp::WARP;
 use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
 use crate::geometry::product::product;
 use crate::geometry::se3;
-use nalgebra::{Cholesky, DMatrix, DVector, Dyn, Isometry3, Matrix6, SVector, Vector3, Vector6};
+use nalgebra::{
+    Cholesky, DMatrix, DVector, Dyn, Isometry3, Matrix6, SVector, Vector2, Vector3, Vector6,
+};
 
 /// Sights prepared for the consensus, and its own working memory.
 #[derive(Clone, Debug, Default)]
@@ -29,7 +31,7 @@ pub(super) struct State {
     cost: f64,
     warp: SVector<f64, WARP>,
     frames: Vec<Frame>,
-    points: Vec<Vector3<f64>>,
+    points: Vec<(Vector3<f64>, Vector2<f64>)>,
 }
 
 /// Damping beyond which no step will help.
@@ -143,7 +145,7 @@ impl Window {
         });
         for s in seen {
             if let Ok(at) = self.landmarks.binary_search_by_key(&s.id, |l| l.id) {
-                self.landmarks[at].observe(serial, s.measurement);
+                self.landmarks[at].observe(serial, s);
             }
         }
     }
@@ -355,15 +357,15 @@ impl Window {
         self.kept.warp = self.warp.coefficients;
         self.kept.frames.clone_from(&self.frames);
         self.kept.points.clear();
-        let points = self.landmarks.iter().map(|l| l.inverse_depth);
+        let points = self.landmarks.iter().map(|l| (l.inverse_depth, l.relief));
         self.kept.points.extend(points);
     }
 
     fn restore(&mut self) {
         self.warp.coefficients = self.kept.warp;
         self.frames.clone_from(&self.kept.frames);
-        for (landmark, point) in self.landmarks.iter_mut().zip(&self.kept.points) {
-            landmark.inverse_depth = *point;
+        for (landmark, (point, relief)) in self.landmarks.iter_mut().zip(&self.kept.points) {
+            (landmark.inverse_depth, landmark.relief) = (*point, *relief);
         }
     }
 
@@ -413,7 +415,8 @@ impl Window {
         let frame_from_anchor = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
         let seen = sight::seen_at(&self.rig, &frame_from_anchor, &landmark.inverse_depth)?;
         let m = self.warp.corrected(&observation.measurement);
-        Some((m.px - seen).component_div(&m.sigma_px).norm_squared())
+        let residual = m.px - seen - observation.by_relief(&landmark.relief);
+        Some(residual.component_div(&m.sigma_px).norm_squared())
     }
 
     fn count_newest(&self) -> u32 {
@@ -423,7 +426,7 @@ impl Window {
     }
 
     /// Squared residuals of all that the newest frame's landmarks were seen as, over their degrees
-    /// of freedom: four coordinates a sight, less three unknowns a landmark, less six for each
+    /// of freedom: four coordinates a sight, less the unknowns of a landmark, less six for each
     /// frame's pose, in the share of its sights that count here. Large ones, compared with the
     /// median, count no more than a Gaussian's largest.
     fn measure_variance(&mut self) -> Option<f64> {
@@ -445,7 +448,7 @@ impl Window {
                 }
             }
             if counts {
-                freedom -= 3.0;
+                freedom -= landmark.settled;
             }
         }
         for [here, all] in &counted[1..] {

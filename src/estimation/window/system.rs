@@ -4,8 +4,8 @@
 //! (Schur complement), so that cost grows linearly with the observations.
 
 use super::super::bundle::{huber_loss, huber_weight};
-use super::super::sight;
-use super::landmark::Landmark;
+use super::super::sight::{self, Sight};
+use super::landmark::{Landmark, Observation};
 use super::memory::Memory;
 use super::warp::{WARP, Warp};
 use super::{Frame, row_of};
@@ -13,10 +13,7 @@ use crate::geometry::product::{
     product, subtract_product_transposed, transposed_product, transposed_scaled,
 };
 use crate::geometry::{StereoRig, se3};
-use nalgebra::{
-    DMatrix, DVector, Isometry3, Matrix3, Matrix6, SMatrix, SVector, Vector2, Vector3, Vector4,
-    Vector6,
-};
+use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, SVector, Vector2, Vector4, Vector6};
 
 /// Where and how observations are linearised.
 #[derive(Clone, Copy, Debug)]
@@ -61,21 +58,27 @@ struct Sightline {
     is_used: bool,
 }
 
+/// Unknowns of a landmark: x, y, ρ and its relief.
+pub(super) const POINT: usize = 5;
+/// A sight's derivative by them.
+type ByPoint = SMatrix<f64, 4, POINT>;
+
 /// A landmark, eliminated.
 #[derive(Clone, Debug)]
 pub(super) struct Reduced {
     pub(super) landmark: usize,
     crosses: std::ops::Range<usize>,
-    pub(super) cov: Matrix3<f64>,
-    gradient: Vector3<f64>,
-    pub(super) by_warp: SMatrix<f64, WARP, 3>,
+    pub(super) cov: SMatrix<f64, POINT, POINT>,
+    gradient: SVector<f64, POINT>,
+    settled: f64,
+    pub(super) by_warp: SMatrix<f64, WARP, POINT>,
 }
 
 /// What joins a landmark to a frame's pose.
 #[derive(Clone, Debug)]
 pub(super) struct Cross {
     pub(super) frame: usize,
-    pub(super) by_point: SMatrix<f64, 6, 3>,
+    pub(super) by_point: SMatrix<f64, 6, POINT>,
 }
 
 impl System {
@@ -160,14 +163,14 @@ impl System {
     fn eliminate(&mut self, at: &At<'_>, index: usize, landmark: &Landmark) -> Option<f64> {
         let (rig, warp, frames) = (at.rig, at.warp, at.frames);
         let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
-        let mut point_point = Matrix3::zeros();
-        let mut point_gradient = Vector3::zeros();
-        let mut warp_point = SMatrix::<f64, WARP, 3>::zeros();
+        let mut point_point = SMatrix::<f64, POINT, POINT>::zeros();
+        let mut point_gradient = SVector::<f64, POINT>::zeros();
+        let mut warp_point = SMatrix::<f64, WARP, POINT>::zeros();
         let mut warp_warp = SMatrix::<f64, WARP, WARP>::zeros();
         let mut warp_gradient = SVector::<f64, WARP>::zeros();
         let mut cost = 0.0;
         let first_cross = self.crosses.len();
-        let mut anchor_by_point = SMatrix::<f64, 6, 3>::zeros();
+        let mut anchor_by_point = SMatrix::<f64, 6, POINT>::zeros();
         let mut sights = 0;
         for observation in &landmark.observations {
             if Some(observation.serial) == at.without {
@@ -191,18 +194,21 @@ impl System {
             }
             sights += 1;
             let (info, residual, loss) = weigh(
-                &(warp.corrected(&observation.measurement).px - seen.px),
+                &(warp.corrected(&observation.measurement).px
+                    - seen.px
+                    - observation.by_relief(&landmark.relief)),
                 &observation.measurement.sigma_px,
                 at.variance_factor,
             );
             cost += loss;
-            let weighted = transposed_scaled(&seen.by_point, &info);
-            point_point += product(&weighted, &seen.by_point);
+            let seen_by_point = by_point(&seen, observation);
+            let weighted = transposed_scaled(&seen_by_point, &info);
+            point_point += product(&weighted, &seen_by_point);
             point_gradient += product(&weighted, &residual);
             let by_warp = warp.derivative(&observation.measurement);
             let warp_weighted = transposed_scaled(&by_warp, &Vector2::new(info[2], info[3]));
             warp_warp += product(&warp_weighted, &by_warp);
-            let right_by_point = seen.by_point.fixed_rows::<2>(2).into_owned();
+            let right_by_point = seen_by_point.fixed_rows::<2>(2).into_owned();
             warp_point += product(&warp_weighted, &right_by_point);
             warp_gradient += product(&warp_weighted, &Vector2::new(residual[2], residual[3]));
             if frame == anchor {
@@ -214,7 +220,7 @@ impl System {
             line.by_warp += product(&of_right, &by_warp);
             line.gradient += product(&weighted, &residual);
             line.is_used = true;
-            let by_point = product(&weighted, &seen.by_point);
+            let by_point = product(&weighted, &seen_by_point);
             anchor_by_point -= product(&line.adjoint_transposed, &by_point);
             self.crosses.push(Cross { frame, by_point });
         }
@@ -226,7 +232,13 @@ impl System {
             frame: anchor,
             by_point: anchor_by_point,
         });
-        for i in 0..3 {
+        // The relief has σ 1, which like all σ is to be scaled.
+        for i in 0..2 {
+            point_point[(3 + i, 3 + i)] += 1.0 / at.variance_factor;
+            point_gradient[3 + i] -= landmark.relief[i] / at.variance_factor;
+        }
+        cost += 0.5 * landmark.relief.norm_squared();
+        for i in 0..POINT {
             point_point[(i, i)] *= 1.0 + at.damping;
         }
         let cov = point_point.cholesky()?.inverse();
@@ -256,6 +268,7 @@ impl System {
             crosses,
             cov,
             gradient: point_gradient,
+            settled: 5.0 - (cov[(3, 3)] + cov[(4, 4)]) / at.variance_factor,
             by_warp: warp_point,
         });
         Some(cost)
@@ -336,10 +349,24 @@ impl System {
                 }
             }
             let landmark = &mut landmarks[r.landmark];
-            landmark.inverse_depth += r.cov * gradient;
-            landmark.cov = r.cov;
+            let step = r.cov * gradient;
+            landmark.inverse_depth += step.fixed_rows::<3>(0);
+            landmark.relief += step.fixed_rows::<2>(3);
+            landmark.settled = r.settled;
+            landmark.cov = r.cov.fixed_view::<3, 3>(0, 0).into_owned();
         }
     }
+}
+
+/// The derivative of a sight by the unknowns of its landmark.
+pub(super) fn by_point(seen: &Sight, observation: &Observation) -> ByPoint {
+    let mut by_point = ByPoint::zeros();
+    by_point.fixed_columns_mut::<3>(0).copy_from(&seen.by_point);
+    for (side, relief_px) in observation.relief_px.iter().enumerate() {
+        by_point[(2 * side, 3)] = *relief_px;
+        by_point[(2 * side + 1, 4)] = *relief_px;
+    }
+    by_point
 }
 
 /// Robust information (a diagonal), the residual, and the loss (σ²) of one frame's measurement. Huber's bend

@@ -4,7 +4,11 @@ use super::super::{Settings, StereoMeasurement};
 use super::*;
 use crate::simulation::{self, points};
 use crate::uncertainty::consistency;
-use nalgebra::{Vector4, Vector6};
+use nalgebra::{Vector2, Vector4, Vector6};
+use rand::SeedableRng;
+use rand_distr::{Distribution, StandardNormal};
+use rand_xoshiro::Xoshiro256PlusPlus;
+use std::collections::HashMap;
 
 /// One run's errors over their covariances.
 struct Run {
@@ -16,13 +20,54 @@ struct Run {
 
 const SIGMA_PX: f64 = 0.5;
 
-fn sights(frame: &points::PointFrame, displaced_px: f64) -> Vec<Seen> {
-    let seen = |s: &points::Sight| Seen {
-        id: s.id,
-        measurement: StereoMeasurement {
-            px: s.pixels + Vector4::new(0.0, 0.0, displaced_px, 0.0),
-            sigma_px: Vector4::repeat(SIGMA_PX),
-        },
+/// Errors that stay with a landmark: each sight is off by so much more, the same way on both sides.
+struct Relief {
+    per_sight_px: f64,
+    /// Whether the window is told.
+    is_stated: bool,
+    /// How often each landmark was seen, and which way it is off.
+    landmarks: HashMap<LandmarkId, (f64, Vector2<f64>)>,
+    rng: Xoshiro256PlusPlus,
+}
+
+impl Relief {
+    fn new(per_sight_px: f64, is_stated: bool, seed: u64) -> Self {
+        Self {
+            per_sight_px,
+            is_stated,
+            landmarks: HashMap::new(),
+            rng: Xoshiro256PlusPlus::seed_from_u64(seed),
+        }
+    }
+
+    /// Adds what stays with a landmark to a sight of it.
+    fn add_to(&mut self, seen: &mut Seen) {
+        let rng = &mut self.rng;
+        let (count, way) = self.landmarks.entry(seen.id).or_insert_with(|| {
+            let mut normal = || StandardNormal.sample(rng);
+            (0.0, Vector2::new(normal(), normal()))
+        });
+        let px = *count * self.per_sight_px;
+        *count += 1.0;
+        seen.measurement.px += px * Vector4::new(way.x, way.y, way.x, way.y);
+        if self.is_stated {
+            seen.relief_px = Vector2::repeat(px);
+        }
+    }
+}
+
+fn sights(frame: &points::PointFrame, displaced_px: f64, relief: &mut Relief) -> Vec<Seen> {
+    let seen = |s: &points::Sight| {
+        let mut seen = Seen {
+            id: s.id,
+            measurement: StereoMeasurement {
+                px: s.pixels + Vector4::new(0.0, 0.0, displaced_px, 0.0),
+                sigma_px: Vector4::repeat(SIGMA_PX),
+            },
+            relief_px: Vector2::zeros(),
+        };
+        relief.add_to(&mut seen);
+        seen
     };
     frame.sights.iter().map(seen).collect()
 }
@@ -33,6 +78,19 @@ fn step() -> Isometry3<f64> {
 
 /// Drives along a gentle curve with a right image that is displaced; every frame is a keyframe.
 fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, seed: u64) -> Run {
+    let mut relief = Relief::new(0.0, false, seed);
+    drive_over(steps, survival, displaced_px, &mut relief, settings, seed)
+}
+
+/// The same where landmarks are off in a way of their own.
+fn drive_over(
+    steps: usize,
+    survival: f64,
+    displaced_px: f64,
+    relief: &mut Relief,
+    settings: &Settings,
+    seed: u64,
+) -> Run {
     let rig = simulation::thesis_rig();
     let world = points::Settings {
         landmarks: 80,
@@ -54,11 +112,11 @@ fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, se
     };
     simulation.observe(&truth, &mut frame);
     window.begin_at(&truth, &(Matrix6::identity() * 1e-16), &BySources::zeros());
-    window.promote(&sights(&frame, displaced_px));
+    window.promote(&sights(&frame, displaced_px, relief));
     for k in 1..=steps {
         truth *= step();
         simulation.observe(&truth, &mut frame);
-        let (known, new): (Vec<Seen>, Vec<Seen>) = sights(&frame, displaced_px)
+        let (known, new): (Vec<Seen>, Vec<Seen>) = sights(&frame, displaced_px, relief)
             .iter()
             .partition(|s| window.landmark(s.id).is_some());
         let weights = vec![1.0; known.len()];
@@ -119,6 +177,31 @@ fn covariances_of_pose_and_motion_hold_whatever_the_length_of_tracks() {
 }
 
 #[test]
+fn what_stays_with_a_landmark_does_not_average_out() {
+    const RUNS: u64 = 60;
+    // All in the window, so that no landmark begins anew.
+    let settings = Settings {
+        keyframes: 12,
+        // What is off by far must not be taken for wrong.
+        gate_sigma2: 1e3,
+        ..exact()
+    };
+    let drive_by = |is_stated| {
+        let runs = (0..RUNS).map(|seed| {
+            let mut relief = Relief::new(0.3, is_stated, seed);
+            drive_over(10, 0.9, 0.0, &mut relief, &settings, seed)
+        });
+        anees(&runs.collect::<Vec<Run>>())
+    };
+    let (pose, motion) = drive_by(true);
+    let (low, high) = consistency::anees_interval(6, RUNS as usize, 0.997);
+    assert!((low..high).contains(&pose), "{pose}");
+    assert!((0.9..1.1).contains(&motion), "{motion}");
+    let (ignored, _) = drive_by(false);
+    assert!(ignored > 1.5 * pose, "{ignored} beside {pose}");
+}
+
+#[test]
 fn a_displaced_right_image_is_found_and_the_pose_covers_it() {
     const RUNS: u64 = 40;
     // As far off as the settings suppose; each run has its own.
@@ -169,11 +252,12 @@ fn a_standing_robot_neither_drifts_nor_grows_its_covariance() {
     let still = Isometry3::identity();
     simulation.observe(&still, &mut frame);
     window.begin_at(&still, &(Matrix6::identity() * 1e-16), &BySources::zeros());
-    window.promote(&sights(&frame, 0.0));
+    let mut relief = Relief::new(0.0, false, 0);
+    window.promote(&sights(&frame, 0.0, &mut relief));
     let mut first_cov = None;
     for k in 1..=60 {
         simulation.observe(&still, &mut frame);
-        let seen = sights(&frame, 0.0);
+        let seen = sights(&frame, 0.0, &mut relief);
         window.add(&still, &seen);
         let tracked = window.adjust().expect("determined");
         window.settle();
