@@ -29,6 +29,8 @@ pub mod matching;
 pub mod montecarlo;
 pub mod output;
 pub mod pipeline;
+#[cfg(test)]
+mod properties;
 mod queue;
 pub mod refinement;
 pub mod rig_watch;

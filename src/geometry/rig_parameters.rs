@@ -283,6 +283,8 @@ mod tests {
     }
 
     proptest! {
+        #![proptest_config(crate::properties::remembered())]
+
         #[test]
         fn undistorted_positions_move_with_parameters_as_central_differences_say(
             x in 20.0..620.0_f64, y in 20.0..460.0_f64

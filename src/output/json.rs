@@ -128,6 +128,8 @@ mod tests {
     use proptest::prelude::*;
 
     proptest! {
+        #![proptest_config(crate::properties::remembered())]
+
         #[test]
         fn every_column_of_the_csv_has_the_same_text(odometry in any_odometry()) {
             let stamp = CaptureTime::Recorded(odometry.timestamp_ns);
