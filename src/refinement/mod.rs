@@ -9,14 +9,16 @@
 mod patch;
 mod pyramid;
 mod slant;
+mod view;
 
 pub use patch::{Aligned, Surface, Template, Warp};
 pub use pyramid::{LEVELS, Pyramid, from_level, to_level};
 pub use slant::Slant;
+pub use view::View;
 
 use crate::estimation::{StereoMeasurement, linearise_sight};
 use crate::geometry::StereoRig;
-use nalgebra::{Isometry3, Matrix2, Matrix4x3, Vector2, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix2, Vector2, Vector3, Vector4};
 
 /// A pair of images, reduced.
 #[derive(Clone, Copy, Debug)]
@@ -72,12 +74,12 @@ pub fn refine(
     let anchor = linearise_sight(rig, &Isometry3::identity(), inverse_depth)?.by_point;
     let now = linearise_sight(rig, now_from_anchor, inverse_depth)?.by_point;
     let by_px: Matrix2<f64> = anchor.fixed_view::<2, 2>(0, 0).try_inverse()?;
-    let by_rays = [*now_from_anchor, rig.right_from_left * now_from_anchor];
+    let cameras = [*now_from_anchor, rig.right_from_left * now_from_anchor];
     let mut appearance = *appearance;
     let (mut px, mut sigma_px) = (Vector4::zeros(), Vector4::zeros());
     let mut relief_px = Vector2::zeros();
     for (side, image) in [(0, images.left), (2, images.right)] {
-        let view = View::new(&now, side, &by_px, &by_rays[side / 2], inverse_depth);
+        let view = View::new(&now, side, &by_px, &cameras[side / 2], inverse_depth);
         let from = Vector2::new(start[side], start[side + 1]);
         let found = coarse_to_fine(&appearance, image, &view, &from, reach_px)?;
         appearance.slant = found.slant;
@@ -121,51 +123,6 @@ pub fn refine_right(
         relief_px: Vector2::new(0.0, found.relief_px),
         slant: found.slant,
     })
-}
-
-/// How an image shows a patch: the plane that it lies in, through a homography.
-#[derive(Clone, Copy, Debug)]
-pub struct View {
-    /// The derivative of a pixel of the image by the one of the anchor that shows the same, on a
-    /// surface of slope 0.
-    pub now_by_anchor: Matrix2<f64>,
-    /// The displacement against what lies at infinity, px.
-    pub lever_px: Vector2<f64>,
-    /// Share by which depth grows with each px of the anchor, on a surface of slope 0 …
-    pub depth_by_px: Vector2<f64>,
-    /// … and with the slope.
-    pub depth_by_slope: f64,
-}
-
-impl View {
-    /// The camera stands at `now_from_anchor`; from the derivatives of all pixels by (x, y, ρ), those of
-    /// the image from `row` on, and of (x, y) by the anchor's pixel.
-    fn new(
-        by_point: &Matrix4x3<f64>,
-        row: usize,
-        by_px: &Matrix2<f64>,
-        now_from_anchor: &Isometry3<f64>,
-        y: &Vector3<f64>,
-    ) -> Self {
-        let ahead = now_from_anchor.inverse() * Vector3::z();
-        let forward = now_from_anchor.translation.z * y.z;
-        let depth = ahead.dot(&Vector3::new(y.x, y.y, 1.0)) + forward;
-        Self {
-            now_by_anchor: by_point.fixed_view::<2, 2>(row, 0) * by_px,
-            lever_px: by_point.fixed_view::<2, 1>(row, 2) * y.z,
-            depth_by_px: by_px.transpose() * ahead.xy() / depth,
-            depth_by_slope: forward / depth,
-        }
-    }
-
-    /// The derivative of a pixel by the anchor's, and of depth, in shares of it, on a surface of any
-    /// slope.
-    fn on(&self, slope: &Vector2<f64>) -> (Matrix2<f64>, Vector2<f64>) {
-        (
-            self.now_by_anchor + self.lever_px * slope.transpose(),
-            self.depth_by_px + slope * self.depth_by_slope,
-        )
-    }
 }
 
 /// A patch found in one image.
@@ -227,7 +184,7 @@ pub fn coarse_to_fine(
             let found = Found {
                 px: at,
                 sigma_px: var.map(f64::sqrt),
-                relief_px: RELIEF_PX * px * deformation(&view.on(&slope).0),
+                relief_px: RELIEF_PX * px * view.deformation(&slope),
                 slant: appearance.slant.after(slope, found.information),
             };
             best = Some((found, var.sum()));
@@ -293,11 +250,6 @@ fn on_level(
         (slope, at) = (found.gap, found.at);
     }
     None
-}
-
-/// How far a derivative is from a rotation: the root of the sum of its principal strains' squares.
-fn deformation(now_by_anchor: &Matrix2<f64>) -> f64 {
-    0.5 * (now_by_anchor.transpose() * now_by_anchor - Matrix2::identity()).norm()
 }
 
 fn coarsest_level(size_px: f64) -> usize {

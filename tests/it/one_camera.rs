@@ -62,6 +62,7 @@ pub(crate) fn assert_unsuitable(open: Open<'_>, says: &str) {
 
 /// Holds a camera that `leave` takes away while it streams to the contract: its stream ends with an error
 /// that says so, and opening it anew fails until it is back.
+#[cfg(any(feature = "v4l", all(feature = "aravis", feature = "ipc")))]
 pub(crate) fn assert_leaves(open: Open<'_>, leave: impl FnOnce(), says: &str) {
     let mut source = open().expect("it is there");
     source.start().expect("starts");

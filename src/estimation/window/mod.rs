@@ -123,9 +123,8 @@ impl VarianceFactor {
     }
 }
 
-/// However small residuals are, no less than this is believed of the stated variance: what stays with a
-/// patch from pair to pair is not in them.
-const MIN_VARIANCE_FACTOR: f64 = 0.4;
+/// However small residuals are, no more than this is believed of the stated σ: half of it.
+const MIN_VARIANCE_FACTOR: f64 = 0.25;
 
 impl Window {
     /// An empty window, to be [begun](Self::begin_at).
