@@ -164,6 +164,18 @@ impl CameraError {
     pub fn is_permanent(&self) -> bool {
         matches!(self, Self::Unsuitable(_))
     }
+
+    /// The same, said of what is named.
+    pub(super) fn of(self, name: &str) -> Self {
+        let named = |text: String| format!("{name}: {text}");
+        match self {
+            Self::Absent(text) => Self::Absent(named(text)),
+            Self::Busy(text) => Self::Busy(named(text)),
+            Self::Unsuitable(text) => Self::Unsuitable(named(text)),
+            Self::Gone(text) => Self::Gone(named(text)),
+            Self::Failed(text) => Self::Failed(named(text)),
+        }
+    }
 }
 
 /// One camera; the module's documentation has the contract.

@@ -296,10 +296,7 @@ impl Session {
             return;
         };
         let sequence = delivery.odometry.sequence;
-        let moved = format!(
-            "the cameras have turned against each other, {}",
-            summary::turn_to_text(rig)
-        );
+        let moved = summary::turn_to_text(rig);
         let misfits = "left and right images miss each other by more than the rig's uncertainty: calibrate anew, \
                        or look at it with visod rig check";
         for (i, (holds, what)) in [(rig.has_moved, moved.as_str()), (rig.misfits, misfits)]

@@ -80,16 +80,13 @@ pub(crate) fn cameras_to_text(cameras: &Snapshot) -> String {
 /// How the rig is.
 fn rig_to_text(rig: &RigState) -> String {
     match (rig.has_moved, rig.misfits) {
-        (true, _) => format!(
-            "the cameras have turned against each other, {}",
-            turn_to_text(rig)
-        ),
+        (true, _) => turn_to_text(rig),
         (_, true) => "the images miss each other by more than its uncertainty".to_owned(),
         _ => "as calibrated".to_owned(),
     }
 }
 
-/// By how much the right camera has turned.
+/// That the cameras have turned against each other, and by how much.
 pub(crate) fn turn_to_text(rig: &RigState) -> String {
     let mrad = |i: usize| {
         format!(
@@ -98,7 +95,12 @@ pub(crate) fn turn_to_text(rig: &RigState) -> String {
             rig.sigma_rad[i] * 1e3
         )
     };
-    format!("pitch {}, yaw {}, roll {} mrad", mrad(0), mrad(1), mrad(2))
+    format!(
+        "the cameras have turned against each other, pitch {}, yaw {}, roll {} mrad",
+        mrad(0),
+        mrad(1),
+        mrad(2)
+    )
 }
 
 /// The summary as JSON.

@@ -26,7 +26,7 @@ use crate::geometry::rig_parameters::{
     CAMERA_PARAMETERS, EXTRINSICS, RIG_PARAMETERS, RigCovariance, RigVector,
 };
 use crate::geometry::{Distortion, StereoRig, se3};
-use nalgebra::{Isometry3, Matrix6, SMatrix, SymmetricEigen, Vector2, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix6, SMatrix, SymmetricEigen, Vector3, Vector4};
 
 /// Independent errors of a rig's parameters that are told apart.
 pub const MODES: usize = 16;
@@ -173,8 +173,6 @@ fn without(whole: &Matrix6<f64>, part: &Matrix6<f64>) -> (Matrix6<f64>, Matrix6<
     (rest, part)
 }
 
-/// Positions across and down the image at which the effect of parameters is weighed.
-const GRID: usize = 5;
 /// Disparities at which it is weighed, px.
 const DISPARITIES_PX: [f64; 3] = [0.0, 10.0, 60.0];
 
@@ -187,15 +185,7 @@ fn modes_of(rig: &StereoRig, covariance: &RigCovariance) -> SMatrix<f64, RIG_PAR
     let mut weight = RigCovariance::zeros();
     let identity = Isometry3::identity();
     let inverse_depth = |disparity_px: f64| disparity_px / (rig.left.focal_px.x * rig.baseline_m());
-    for i in 0..GRID * GRID {
-        let share = |n: usize| (n as f64 + 0.5) / GRID as f64;
-        let px = Vector2::new(
-            share(i % GRID) * f64::from(rig.left.width),
-            share(i / GRID) * f64::from(rig.left.height),
-        );
-        let Some(ray) = rig.left.unproject(&px) else {
-            continue;
-        };
+    for ray in rig.left.spread_rays() {
         for disparity_px in DISPARITIES_PX {
             let y = ray.push(inverse_depth(disparity_px));
             if let Some(by) = sight_by_rig(rig, &identity, &y) {
@@ -272,7 +262,7 @@ mod tests {
     use super::*;
     use crate::geometry::RigUncertainty;
     use crate::simulation::thesis_rig;
-    use nalgebra::Vector6;
+    use nalgebra::{Vector2, Vector6};
     use proptest::prelude::*;
 
     fn stated() -> StereoRig {

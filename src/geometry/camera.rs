@@ -86,6 +86,19 @@ impl Camera {
         ))
     }
 
+    /// The rays through pixels that are spread evenly over the image, five across and five down, row by
+    /// row; left out where the lens' model has no inverse.
+    pub fn spread_rays(&self) -> impl Iterator<Item = Vector2<f64>> + '_ {
+        const GRID: u32 = 5;
+        let share = |n: u32| (f64::from(n) + 0.5) / f64::from(GRID);
+        (0..GRID * GRID).filter_map(move |i| {
+            self.unproject(&Vector2::new(
+                share(i % GRID) * f64::from(self.width),
+                share(i / GRID) * f64::from(self.height),
+            ))
+        })
+    }
+
     /// The position on the normalised plane (z = 1) that is seen at `pixel`, undistorted.
     ///
     /// `None` where the distortion model has no inverse.

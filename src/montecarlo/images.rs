@@ -146,15 +146,7 @@ fn follow(rig: &StereoRig, seen: StereoRig, settings: &Settings, run: u64) -> Op
     let mut described = DescribedPair::default();
     for frame in 0..=settings.steps as u64 {
         let (pair, truth) = simulation.pair(frame);
-        described.sequence = pair.sequence;
-        described.timestamp_ns = pair.timestamp_ns;
-        for (side, image) in [
-            (&mut described.left, &pair.left),
-            (&mut described.right, &pair.right),
-        ] {
-            extractor.extract(image, &mut side.features).ok()?;
-            side.pyramid.fill(image);
-        }
+        described.describe(extractor.as_mut(), &pair).ok()?;
         let row = method.step(&mut described).ok()?;
         judge.take(&row, truth);
     }

@@ -32,16 +32,10 @@ fn film(trajectory: TrajectoryName, frames: u64, shake: f64) -> Film {
     };
     for frame in 0..frames {
         let (pair, truth) = simulation.pair(frame);
-        let mut described = DescribedPair::from(&pair);
-        for (side, image) in [
-            (&mut described.left, &pair.left),
-            (&mut described.right, &pair.right),
-        ] {
-            extractor
-                .extract(image, &mut side.features)
-                .expect("features");
-            side.pyramid.fill(image);
-        }
+        let mut described = DescribedPair::default();
+        described
+            .describe(extractor.as_mut(), &pair)
+            .expect("features");
         film.pairs.push(described);
         film.truth.push(truth);
     }
@@ -161,16 +155,10 @@ fn a_known_skew_is_compensated_and_its_uncertainty_stands_in_the_budget() {
                 ns: skew_ns,
                 sigma_ns: 100_000.0,
             };
-            let mut described = DescribedPair::from(&pair);
-            for (side, image) in [
-                (&mut described.left, &pair.left),
-                (&mut described.right, &pair.right),
-            ] {
-                extractor
-                    .extract(image, &mut side.features)
-                    .expect("features");
-                side.pyramid.fill(image);
-            }
+            let mut described = DescribedPair::default();
+            described
+                .describe(extractor.as_mut(), &pair)
+                .expect("features");
             film.pairs.push(described);
             film.truth.push(truth);
         }

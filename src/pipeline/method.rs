@@ -9,7 +9,7 @@ use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
 use crate::estimation::sources::{Exposure, RigErrors};
 use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement};
-use crate::features::Features;
+use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
@@ -312,6 +312,27 @@ fn measurement(pair: &DescribedPair, m: StereoMatch) -> StereoMeasurement {
             f64::from(r.y_px),
         ),
         sigma_px: Vector4::new(sl, sl, sr, sr),
+    }
+}
+
+impl DescribedPair {
+    /// Takes on what `extractor` finds in a pair's images.
+    ///
+    /// # Errors
+    /// The extractor's.
+    pub fn describe(
+        &mut self,
+        extractor: &mut dyn Extractor,
+        pair: &StereoPair,
+    ) -> Result<(), ExtractError> {
+        self.sequence = pair.sequence;
+        self.timestamp_ns = pair.timestamp_ns;
+        self.skew = pair.skew;
+        for (side, image) in [(&mut self.left, &pair.left), (&mut self.right, &pair.right)] {
+            extractor.extract(image, &mut side.features)?;
+            side.pyramid.fill(image);
+        }
+        Ok(())
     }
 }
 

@@ -145,8 +145,6 @@ fn terms(rig: &StereoRig, rectified_px: &Vector2<f64>) -> SVector<f64, STATICS> 
     SVector::from([1.0, at.x, at.y, at.x * at.x, at.x * at.y, at.y * at.y])
 }
 
-/// Positions across and down the image at which the terms are fitted to what parameters do.
-const GRID: usize = 5;
 /// Keeps the prior invertible where a calibration is taken as exact, px².
 const SMALLEST_VARIANCE_PX2: f64 = 1e-8;
 /// For numeric derivatives of the rectified row, px.
@@ -168,15 +166,8 @@ fn stated(rig: &StereoRig, rectification: &Rectification) -> Option<StaticsCovar
     let covariance = rig.covariance()?;
     let mut normal = StaticsCovariance::zeros();
     let mut by_rig = SMatrix::<f64, STATICS, RIG_PARAMETERS>::zeros();
-    for i in 0..GRID * GRID {
-        let share = |n: usize| (n as f64 + 0.5) / GRID as f64;
-        let left_px = Vector2::new(
-            share(i % GRID) * f64::from(rig.left.width),
-            share(i / GRID) * f64::from(rig.left.height),
-        );
-        let infinity = rig.left.unproject(&left_px).map(|ray| ray.push(0.0));
-        let Some((terms, row_by_rig)) = infinity.and_then(|y| missed(rig, rectification, &y))
-        else {
+    for ray in rig.left.spread_rays() {
+        let Some((terms, row_by_rig)) = missed(rig, rectification, &ray.push(0.0)) else {
             continue;
         };
         normal += terms * terms.transpose();

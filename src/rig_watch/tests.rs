@@ -201,16 +201,10 @@ fn film(rig: &StereoRig, from: u64) -> Film {
         let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
         let mut describe = |frame: u64| {
             let (pair, truth) = simulation.pair(frame);
-            let mut described = DescribedPair::from(&pair);
-            for (side, image) in [
-                (&mut described.left, &pair.left),
-                (&mut described.right, &pair.right),
-            ] {
-                extractor
-                    .extract(image, &mut side.features)
-                    .expect("features");
-                side.pyramid.fill(image);
-            }
+            let mut described = DescribedPair::default();
+            described
+                .describe(extractor.as_mut(), &pair)
+                .expect("features");
             (described, truth)
         };
         (from + first..PAIRS)

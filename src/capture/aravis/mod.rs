@@ -69,7 +69,7 @@ impl AravisCamera {
     pub fn open(settings: &CameraSettings, size_px: (u32, u32)) -> Result<Self, CameraError> {
         let (camera, found) = discovery::open(&settings.id)?;
         let identity = found.identity();
-        let named = |e: CameraError| prefixed(&identity, e);
+        let named = |e: CameraError| e.of(&identity);
         let configured = configure::apply(&camera, settings, size_px).map_err(named)?;
         let control_lost = Arc::new(AtomicBool::new(false));
         if let Some(device) = camera.device() {
@@ -240,17 +240,6 @@ fn arrival_ns(buffer: &Buffer) -> i64 {
         arrived_ns
     } else {
         now_ns
-    }
-}
-
-fn prefixed(identity: &str, error: CameraError) -> CameraError {
-    let named = |text: String| format!("{identity}: {text}");
-    match error {
-        CameraError::Absent(text) => CameraError::Absent(named(text)),
-        CameraError::Busy(text) => CameraError::Busy(named(text)),
-        CameraError::Unsuitable(text) => CameraError::Unsuitable(named(text)),
-        CameraError::Gone(text) => CameraError::Gone(named(text)),
-        CameraError::Failed(text) => CameraError::Failed(named(text)),
     }
 }
 

@@ -120,14 +120,7 @@ impl LiveSource {
 }
 
 fn of_side(side: Side, error: CameraError) -> CameraError {
-    let named = |text: String| format!("camera.{}: {text}", name_of(side));
-    match error {
-        CameraError::Absent(text) => CameraError::Absent(named(text)),
-        CameraError::Busy(text) => CameraError::Busy(named(text)),
-        CameraError::Unsuitable(text) => CameraError::Unsuitable(named(text)),
-        CameraError::Gone(text) => CameraError::Gone(named(text)),
-        CameraError::Failed(text) => CameraError::Failed(named(text)),
-    }
+    error.of(&format!("camera.{}", name_of(side)))
 }
 
 /// `left` or `right`.

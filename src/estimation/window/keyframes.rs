@@ -26,7 +26,9 @@ impl Window {
             let met = Landmark::new(&self.rig, s.id, newest, s.measurement, &calibrated);
             if let Some(landmark) = met {
                 let sights = self.spare_sights.pop().unwrap_or_else(room_for_sights);
-                self.landmarks.push(landmark.with_first_sight(sights, s));
+                let first = Observation::new(newest, s);
+                self.landmarks
+                    .push(landmark.with_first_sight(sights, first));
             }
         }
         // An id may come back after its landmark was given up.
@@ -230,12 +232,11 @@ impl Window {
             });
             match (anew, last) {
                 (Some(anew), Some(last)) => {
-                    let first = Seen {
-                        id: landmark.id,
-                        measurement: last.measurement,
+                    let first = Observation {
                         relief_px: Vector2::zeros(),
+                        ..last
                     };
-                    *landmark = anew.with_first_sight(sights, &first);
+                    *landmark = anew.with_first_sight(sights, first);
                     true
                 }
                 _ => {

@@ -20,6 +20,15 @@ pub struct Observation {
 }
 
 impl Observation {
+    /// What the frame of this serial saw.
+    pub(super) fn new(serial: u64, seen: &Seen) -> Self {
+        Self {
+            serial,
+            measurement: seen.measurement,
+            relief_px: seen.relief_px,
+        }
+    }
+
     /// What the landmark's relief does to the sight, px.
     pub(super) fn by_relief(&self, relief: &Vector2<f64>) -> Vector4<f64> {
         let [left, right] = self.relief_px.into();
@@ -84,24 +93,20 @@ impl Landmark {
     }
 
     /// The landmark with what its anchor saw as the only sight in `sights`, whose memory is used again.
-    pub(super) fn with_first_sight(mut self, mut sights: Vec<Observation>, first: &Seen) -> Self {
+    pub(super) fn with_first_sight(
+        mut self,
+        mut sights: Vec<Observation>,
+        first: Observation,
+    ) -> Self {
         sights.clear();
-        sights.push(Observation {
-            serial: self.anchor,
-            measurement: first.measurement,
-            relief_px: first.relief_px,
-        });
+        sights.push(first);
         self.observations = sights;
         self
     }
 
     /// Takes note of one more sight.
     pub(super) fn observe(&mut self, serial: u64, seen: &Seen) {
-        self.observations.push(Observation {
-            serial,
-            measurement: seen.measurement,
-            relief_px: seen.relief_px,
-        });
+        self.observations.push(Observation::new(serial, seen));
     }
 
     /// Forgets what one frame saw.

@@ -90,9 +90,6 @@ pub(super) fn prior_covariance(rig: &StereoRig, settings: &Settings) -> WarpCova
 /// Keeps the information finite where a calibration is taken as exact.
 const SMALLEST_VARIANCE_PX2: f64 = 1e-12;
 
-/// Positions across and down the image at which the warp is fitted to what parameters do.
-const GRID: usize = 5;
-
 /// The warp that fits best to what errors of the rig's parameters do to points at infinity: their
 /// displacement on the right, less the one on the left.
 fn stated_covariance(rig: &StereoRig) -> Option<WarpCovariance> {
@@ -100,15 +97,7 @@ fn stated_covariance(rig: &StereoRig) -> Option<WarpCovariance> {
     let warp = Warp::new(rig);
     let mut normal = WarpCovariance::zeros();
     let mut by_rig = SMatrix::<f64, WARP, RIG_PARAMETERS>::zeros();
-    for i in 0..GRID * GRID {
-        let share = |n: usize| (n as f64 + 0.5) / GRID as f64;
-        let left_px = Vector2::new(
-            share(i % GRID) * f64::from(rig.left.width),
-            share(i / GRID) * f64::from(rig.left.height),
-        );
-        let Some(ray) = rig.left.unproject(&left_px) else {
-            continue;
-        };
+    for ray in rig.left.spread_rays() {
         let infinity = ray.push(0.0);
         let identity = Isometry3::identity();
         let (Some(px), Some(by)) = (
