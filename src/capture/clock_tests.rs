@@ -269,6 +269,48 @@ fn a_clock_that_is_set_ahead_is_recognised_at_once_and_one_set_back_soon() {
     }
 }
 
+/// A host that is busy for a second or two at a time holds up even the most punctual frames. No fit can tell
+/// that from a drift every time, but σ must know of it.
+#[test]
+fn a_floor_that_creeps_is_no_drift() {
+    const RUNS: u64 = 200;
+    for (creep_ns, seconds) in [(100e3, 8), (500e3, 8), (500e3, 50)] {
+        let mut errors = Vec::new();
+        for seed in 0..RUNS {
+            let mut camera = Camera::new(seed, 50e-6, 3_000_000);
+            camera.mean_delay_ns = 20e3;
+            let mut load = Xoshiro256PlusPlus::seed_from_u64(5000 + seed);
+            let mut clock = ClockMap::new();
+            let (mut held_up_ns, mut until) = (0.0, 0);
+            let mut last = None;
+            for n in 0..seconds * 20 {
+                if n == until {
+                    held_up_ns = creep_ns * load.random::<f64>();
+                    until = n + load.random_range(10..40);
+                }
+                let (camera_ns, arrived_ns) = camera.frame(taken(n));
+                last = Some((n, clock.map(camera_ns, arrived_ns + held_up_ns as i64)));
+            }
+            let (n, mapped) = last.expect("mapped");
+            let truth = taken(n) as f64 + LEAST_DELAY_NS;
+            errors.push((mapped.host_ns as f64 - truth) / mapped.sigma_ns);
+        }
+        let n = errors.len() as f64;
+        let rms = (errors.iter().map(|e| e * e).sum::<f64>() / n).sqrt();
+        let beyond = errors.iter().filter(|e| e.abs() > 3.0).count() as f64 / n;
+        println!("{creep_ns} ns over {seconds} s: rms {rms:.2} σ, {beyond:.3} beyond 3 σ");
+        assert!(
+            rms > 0.3,
+            "{creep_ns} ns over {seconds} s: rms {rms} σ says nothing"
+        );
+        assert!(rms < 2.2, "{creep_ns} ns over {seconds} s: rms {rms} σ");
+        assert!(
+            beyond < 0.06,
+            "{creep_ns} ns over {seconds} s: {beyond} beyond 3 σ"
+        );
+    }
+}
+
 /// A busy host hands over a backlog: late, but no step.
 #[test]
 fn a_backlog_is_no_step() {
