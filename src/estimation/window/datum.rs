@@ -67,6 +67,11 @@ impl Datum {
         carried(&by_window, cov_window) + carry * self.cov * carry.transpose()
     }
 
+    /// Adds to the covariance of the datum's pose, in what is independent of the window.
+    pub(super) fn add(&mut self, cov: &Matrix6<f64>) {
+        self.cov += cov;
+    }
+
     /// The derivative of the same pose by each source of error, given that of the `n` unknowns
     /// of the warp and all poses but the datum's.
     pub(super) fn sensitivity_of(

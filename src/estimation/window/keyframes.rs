@@ -203,6 +203,7 @@ impl Window {
             &by_rest,
             &cov_first,
         );
+        self.datum.add(&self.beyond_chance(&self.cov_second));
         let first = self.frames[1].datum_from_frame;
         self.frames.remove(0);
         let last = self.frames.len() - 1;

@@ -18,6 +18,7 @@
 //! that marginalisation adds no knowledge that is not there.
 
 mod datum;
+mod dispersion;
 mod keyframes;
 mod landmark;
 mod memory;
@@ -37,6 +38,7 @@ use super::sources::{BySources, Exposure, RigErrors, SOURCES};
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
 use datum::Datum;
+use dispersion::Dispersion;
 use memory::Memory;
 use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4};
 use planar::Ground;
@@ -96,6 +98,9 @@ pub struct Window {
     landmarks: Vec<Landmark>,
     next_serial: u64,
     variance: VarianceFactor,
+    dispersion: Dispersion,
+    /// Covariance of the second frame's pose, the datum's and the warp being given.
+    cov_second: Matrix6<f64>,
     system: System,
     memory: Memory,
     kept: State,
@@ -156,6 +161,8 @@ impl Window {
                 smoothed: 1.0,
                 frames: 0,
             },
+            dispersion: Dispersion::default(),
+            cov_second: Matrix6::zeros(),
             system: System::default(),
             memory: Memory::default(),
             kept: State::default(),
@@ -222,6 +229,13 @@ impl Window {
         self.variance.smoothed
     }
 
+    /// By how much more a pose's error scatters than independent errors of the pixels would make it: 1 or
+    /// more. It is in every pose's covariance.
+    #[must_use]
+    pub fn dispersion(&self) -> f64 {
+        self.dispersion.factor()
+    }
+
     /// Pose of the newest frame in the odometry frame.
     #[must_use]
     pub fn odom_from_newest(&self) -> Isometry3<f64> {
@@ -269,7 +283,16 @@ impl Window {
     }
 
     fn pose_covariance(&self, newest: &Isometry3<f64>, cov_window: &Joint) -> Matrix6<f64> {
-        se3::symmetric(&self.datum.covariance_of(newest, cov_window))
+        let mut cov = self.datum.covariance_of(newest, cov_window);
+        if let Some(last) = self.frames.len().checked_sub(1).filter(|last| *last > 0) {
+            cov += self.beyond_chance(&dispersion::of_pose_given_warp(cov_window, last));
+        }
+        se3::symmetric(&cov)
+    }
+
+    /// What a covariance that takes errors for independent lacks.
+    fn beyond_chance(&self, cov: &Matrix6<f64>) -> Matrix6<f64> {
+        cov * (self.dispersion.factor() - 1.0)
     }
 }
 

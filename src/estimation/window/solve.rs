@@ -5,6 +5,7 @@ use super::super::consensus::{self, Room, Search, Sighting};
 use super::super::sight;
 use super::super::sources::{BySources, Exposure, SOURCES};
 use super::datum::Datum;
+use super::dispersion;
 use super::memory::{ByUnknowns, Memory, UnknownsBySources, carried};
 use super::prior::Prior;
 use super::system::{At, System};
@@ -218,10 +219,36 @@ impl Window {
         // With the weights that the joint covariance has.
         let by_sources = self.by_sources(joint);
         let variance_factor = self.measure_variance()?;
+        self.watch_dispersion(joint);
         self.variance.take(variance_factor);
         self.cov_warp = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
         self.warp_by_sources = by_sources.fixed_view::<WARP, SOURCES>(0, 0).into_owned();
         Some(self.tracked(joint, &by_sources, variance_factor, inliers))
+    }
+
+    /// Measures once a keyframe by how much more than chance poses scatter, while all but the newest frame
+    /// are keyframes: a robot that stands learns nothing of it.
+    fn watch_dispersion(&mut self, joint: &Joint) {
+        if self.frames.len() >= 2 {
+            self.cov_second = dispersion::of_pose_given_warp(joint, 1);
+        }
+        if self
+            .frames
+            .iter()
+            .rev()
+            .nth(1)
+            .is_some_and(|f| f.is_keyframe)
+        {
+            let at = At {
+                rig: &self.rig,
+                warp: &self.warp,
+                frames: &self.frames,
+                without: None,
+                variance_factor: self.variance.smoothed,
+                damping: 0.0,
+            };
+            self.dispersion.take(&at, &self.landmarks, joint);
+        }
     }
 
     /// Adjusts warp, poses and landmarks; the joint covariance of warp and poses at the optimum.
