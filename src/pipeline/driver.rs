@@ -72,11 +72,31 @@ pub struct Delivery<'a> {
     /// How long it took; zero for a pair that was not usable.
     pub latencies: StageLatencies,
     /// Why the pair was not usable, where it was not.
-    pub unusable: Option<&'a str>,
+    pub unusable: Option<Fault<'a>>,
     /// The images, where there are both.
     pub pair: Option<&'a StereoPair>,
     /// How the rig is, where it is watched.
     pub rig: Option<RigState>,
+}
+
+/// Why a pair could not be used, and who found out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault<'a> {
+    /// The stage that it got no further than.
+    pub stage: Stage,
+    /// The reason, for a person.
+    pub why: &'a str,
+}
+
+/// The stages that a pair may fail in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Its images never came, or cannot be read.
+    Capture,
+    /// No features could be looked for.
+    Features,
+    /// Its features could not be matched.
+    Matching,
 }
 
 /// Why a run ended early.
@@ -323,7 +343,10 @@ fn collect<E>(
             let delivery = Delivery {
                 odometry: &outcome.odometry,
                 latencies: outcome.latencies,
-                unusable: outcome.unusable.as_deref(),
+                unusable: outcome.fault.as_ref().map(|(stage, why)| Fault {
+                    stage: *stage,
+                    why,
+                }),
                 pair: outcome.buffers.used.as_ref(),
                 rig: method.rig_state(),
             };
@@ -344,7 +367,7 @@ fn collect<E>(
 struct Outcome {
     odometry: Odometry,
     latencies: StageLatencies,
-    unusable: Option<String>,
+    fault: Option<(Stage, String)>,
     buffers: Spare,
 }
 
@@ -360,7 +383,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
             Some(Outcome {
                 odometry: method.skip(stamp),
                 latencies: StageLatencies::default(),
-                unusable: Some(unusable.why),
+                fault: Some((Stage::Capture, unusable.why)),
                 buffers,
             })
         }
@@ -374,12 +397,14 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 right: right.job.described,
             };
             let stepped = match left.failed.or(right.failed) {
-                Some(why) => Err(why),
-                None => method.step(described).map_err(|e| e.to_string()),
+                Some(why) => Err((Stage::Features, why)),
+                None => method
+                    .step(described)
+                    .map_err(|e| (Stage::Matching, e.to_string())),
             };
-            let (odometry, unusable) = match stepped {
+            let (odometry, fault) = match stepped {
                 Ok(odometry) => (odometry, None),
-                Err(why) => (method.skip(stamp), Some(why)),
+                Err(fault) => (method.skip(stamp), Some(fault)),
             };
             let times = method.times();
             Some(Outcome {
@@ -390,7 +415,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                     estimation: times.estimation,
                     total: left.job.arrived.elapsed(),
                 },
-                unusable,
+                fault,
                 buffers: Spare {
                     used: Some(StereoPair {
                         sequence: stamp.sequence,
