@@ -113,11 +113,22 @@ pub enum PipelineError<E> {
     Worker,
 }
 
-/// Pairs under way at once, beyond one a worker.
+/// Pairs under way at once, beyond one a worker: no thread ever waits for another's buffers.
 const SLACK_PAIRS: usize = 2;
 
+/// How many pairs may be under way at once. Of live ones only as many as are worked on, one by the method and
+/// the others by two workers each: when the stages are late, pairs wait with the source, which drops the
+/// stalest, and not in here, where each that waits makes all that follow later.
+fn pairs_under_way(is_live: bool, workers: usize) -> usize {
+    if is_live {
+        1 + workers.div_ceil(2)
+    } else {
+        workers + SLACK_PAIRS
+    }
+}
+
 /// Carries every pair of `source` through `method` and hands each row to `deliver`, in order,
-/// until the source ends or `deliver` breaks off. No pair is dropped.
+/// until the source ends or `deliver` breaks off. No pair is dropped here.
 ///
 /// `extractors` holds one for each feature worker, all alike.
 ///
@@ -130,7 +141,7 @@ pub fn run<S: PairSource, E>(
     mut deliver: impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), PipelineError<E>> {
     prepare_thread();
-    let under_way = extractors.len() + SLACK_PAIRS;
+    let under_way = pairs_under_way(source.is_live(), extractors.len());
     source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
     let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);

@@ -1,49 +1,48 @@
 //! The daemon in a process of its own, on two cameras that are files, with a subscriber here.
 
+use super::memory::Recording;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
+use visod::geometry::rig_to_toml;
 use visod::output::message::OdometryMessage;
 use visod::output::publication::Settings as Publication;
 use visod::output::subscriber::{OdometrySubscriber, Wake};
-use visod::simulation::{
-    DatasetWriter, SceneName, Settings, Simulation, TrajectoryName, small_rig,
-};
+use visod::simulation::small_rig;
 
 type Fallible<T> = Result<T, Box<dyn std::error::Error>>;
 
 /// Pairs that are rendered; the cameras show them forth and back.
 const RENDERED: u64 = 24;
 
-/// A recording of small images, 320 × 240 px, whose pairs come at the given times.
+/// A recording of small images, 320 × 240 px, whose pairs come at the given times; they are files that cost
+/// little to read.
 ///
 /// # Errors
 /// The disk is full, or has no hard links.
 pub fn record(folder: &Path, times_s: &[f64]) -> Fallible<()> {
-    let settings = Settings {
-        frames: RENDERED,
-        ..Settings::default()
-    };
-    let (scene, way) = (SceneName::Room, TrajectoryName::LoopRoom);
-    let simulation = Simulation::new(scene, way, small_rig(), settings)?;
-    let mut writer = DatasetWriter::create(folder, simulation.rig())?;
-    for frame in 0..RENDERED {
-        let (pair, pose) = simulation.pair(frame);
-        writer.add(&pair, &pose)?;
+    let recording = Recording::simulated(small_rig(), RENDERED);
+    let name = |side: &str, n: u64| folder.join(format!("{side}/{n:06}.pgm"));
+    for side in ["left", "right"] {
+        std::fs::create_dir_all(folder.join(side))?;
     }
-    writer.finish()?;
-    let there_and_back = 2 * (RENDERED - 1);
-    let name = |side: &str, n: u64| folder.join(format!("{side}/{n:06}.png"));
-    for n in RENDERED..times_s.len() as u64 {
-        let at = n % there_and_back;
-        let at = at.min(there_and_back - at);
+    for n in 0..times_s.len() as u64 {
+        let at = recording.index(n) as u64;
         for side in ["left", "right"] {
-            std::fs::hard_link(name(side, at), name(side, n))?;
+            if n >= RENDERED {
+                std::fs::hard_link(name(side, at), name(side, n))?;
+                continue;
+            }
+            let pair = &recording.pairs[at as usize];
+            let image = if side == "left" { &pair.left } else { &pair.right };
+            let mut pgm = format!("P5\n{} {}\n255\n", image.width(), image.height()).into_bytes();
+            pgm.extend_from_slice(image.pixels());
+            std::fs::write(name(side, n), pgm)?;
         }
     }
     let times: String = times_s.iter().map(|time| format!("{time:.9}\n")).collect();
     std::fs::write(folder.join("times.txt"), times)?;
-    std::fs::remove_file(folder.join("poses.txt"))?;
+    std::fs::write(folder.join("rig.toml"), rig_to_toml(&recording.rig))?;
     Ok(())
 }
 
@@ -70,7 +69,7 @@ impl Daemon {
         let recording = recording.display();
         let camera = |side| format!("[camera.{side}]\ndriver = \"files\"\nid = \"{recording}\"\n");
         let config = format!(
-            "rig = \"{recording}/rig.toml\"\n{}{}[features.surf]\nbudget = 100\n\
+            "rig = \"{recording}/rig.toml\"\n{}{}\
              [publish]\nroot = \"{}\"\nprefix = \"visod_bench_\"\n{more}",
             camera("left"),
             camera("right"),
