@@ -1,6 +1,6 @@
 //! Many pairs through the whole daemon: does anything grow? `cargo bench --bench soak [-- PAIRS [RATE_HZ]]`.
 //!
-//! The daemon follows two cameras that are files of 320 × 240 px, publishes to a subscriber in another
+//! The daemon follows two cameras that are files of 320 × 240 px, looks for few features, publishes to a subscriber in another
 //! process, answers for Prometheus and keeps its last pose. A tenth of the pairs is for warming up.
 
 mod common;
@@ -54,7 +54,7 @@ fn main() -> Fallible<()> {
     let times_s: Vec<f64> = (0..pairs).map(|n| n as f64 / rate_hz).collect();
     record(&recording, &times_s)?;
     let more = format!(
-        "[metrics]\nlisten = \"{0}/metrics\"\n[last_pose]\nfile = \"{0}/last_pose.toml\"\nevery_s = 1.0\n",
+        "[features.surf]\nbudget = 80\n[metrics]\nlisten = \"{0}/metrics\"\n[last_pose]\nfile = \"{0}/last_pose.toml\"\nevery_s = 1.0\n",
         folder.path().display()
     );
     let daemon = Daemon::start(folder.path(), &recording, &more)?;
