@@ -12,10 +12,10 @@ use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{
     DescriptorEncoder, EncodeLabelSet, EncodeMetric, MetricEncoder, prometheus_text,
 };
+use prometheus_client::metrics::MetricType;
 use prometheus_client::metrics::counter::ConstCounter;
 use prometheus_client::metrics::gauge::ConstGauge;
 use prometheus_client::metrics::histogram::Histogram;
-use prometheus_client::metrics::MetricType;
 use prometheus_client::registry::Registry;
 use std::fmt;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
@@ -63,9 +63,10 @@ impl Metrics {
         config: &Config,
         cameras: Monitor,
     ) -> Result<Option<(Self, Exposition)>, Failure> {
-        let address = config.metrics.address().map_err(|e| {
-            Failure::usage(format!("metrics.{}: {}", e.key, e.cause))
-        })?;
+        let address = config
+            .metrics
+            .address()
+            .map_err(|e| Failure::usage(format!("metrics.{}: {}", e.key, e.cause)))?;
         let Some(address) = address else {
             return Ok(None);
         };
@@ -105,10 +106,7 @@ impl Metrics {
     }
 
     fn totals(&self) -> MutexGuard<'_, Totals> {
-        self.0
-            .totals
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
+        self.0.totals.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -161,25 +159,53 @@ impl Page<'_> {
                 (labels, d.count)
             }),
         )?;
-        self.counter("epochs", "Times that the odometry frame began anew", counts.restarts)?;
-        self.counter("overruns", "Rows that came after service.deadline_s", totals.overruns)?;
+        self.counter(
+            "epochs",
+            "Times that the odometry frame began anew",
+            counts.restarts,
+        )?;
+        self.counter(
+            "overruns",
+            "Rows that came after service.deadline_s",
+            totals.overruns,
+        )?;
         self.counter(
             "over_period",
             "Rows that took more work than there is time between two pairs",
             totals.over_period,
         )?;
         self.counter("published", "Messages of visod/odometry", totals.published)?;
-        self.gauge("subscribers", "Subscribers of visod/odometry", totals.subscribers as f64)?;
-        self.gauge("features_share", "Share of the features that is looked for", f64::from(totals.share))?;
-        self.gauge("pairs_waiting", "Pairs that wait for the stages", cameras.waiting as f64)?;
+        self.gauge(
+            "subscribers",
+            "Subscribers of visod/odometry",
+            totals.subscribers as f64,
+        )?;
+        self.gauge(
+            "features_share",
+            "Share of the features that is looked for",
+            f64::from(totals.share),
+        )?;
+        self.gauge(
+            "pairs_waiting",
+            "Pairs that wait for the stages",
+            cameras.waiting as f64,
+        )?;
         let period = Duration::from_nanos(u64::try_from(cameras.period_ns).unwrap_or(0));
-        self.gauge("period_seconds", "Time between two pairs, as it usually is", period.as_secs_f64())
+        self.gauge(
+            "period_seconds",
+            "Time between two pairs, as it usually is",
+            period.as_secs_f64(),
+        )
     }
 
     fn cameras(&mut self, cameras: &Snapshot) -> fmt::Result {
         let sides = || ["left", "right"].into_iter().zip(&cameras.cameras);
         let of = |side| [("camera", side)];
-        self.counters("frames", "Frames received", sides().map(|(side, c)| (of(side), c.frames)))?;
+        self.counters(
+            "frames",
+            "Frames received",
+            sides().map(|(side, c)| (of(side), c.frames)),
+        )?;
         self.counters(
             "reconnects",
             "Times that a camera was opened anew",
@@ -202,12 +228,16 @@ impl Page<'_> {
     }
 
     fn counter(&mut self, name: &str, help: &str, count: u64) -> fmt::Result {
-        let encoder = self.0.encode_descriptor(name, help, None, MetricType::Counter)?;
+        let encoder = self
+            .0
+            .encode_descriptor(name, help, None, MetricType::Counter)?;
         ConstCounter::new(count).encode(encoder)
     }
 
     fn gauge(&mut self, name: &str, help: &str, value: f64) -> fmt::Result {
-        let encoder = self.0.encode_descriptor(name, help, None, MetricType::Gauge)?;
+        let encoder = self
+            .0
+            .encode_descriptor(name, help, None, MetricType::Gauge)?;
         ConstGauge::new(value).encode(encoder)
     }
 

@@ -236,11 +236,7 @@ impl Session {
         let mut first_unusable = None;
         let mut last = None;
         pipeline::run(source, extractors, &mut method, |delivery| {
-            statistics.add(
-                delivery.odometry,
-                &delivery.latencies,
-                delivery.unusable,
-            );
+            statistics.add(delivery.odometry, &delivery.latencies, delivery.unusable);
             if let Some(Fault { why, .. }) = delivery.unusable {
                 let sequence = delivery.odometry.sequence;
                 // Cameras say themselves what happens to them, once and not for each pair.

@@ -32,7 +32,9 @@ impl Start {
     pub fn cov_right(&self, now: Instant) -> Matrix6<f64> {
         let t_s = (self.gap + now.saturating_duration_since(self.made)).as_secs_f64();
         let (moved_m, turned_rad) = (self.sigma_speed_m_s * t_s, self.sigma_turn_rad_s * t_s);
-        let sigma = Vector6::new(moved_m, moved_m, moved_m, turned_rad, turned_rad, turned_rad);
+        let sigma = Vector6::new(
+            moved_m, moved_m, moved_m, turned_rad, turned_rad, turned_rad,
+        );
         let then = se3::cov_right_from_fixed_axes(&self.odom_from_camera, &self.cov_pose);
         then + Matrix6::from_diagonal(&sigma.component_mul(&sigma))
     }
@@ -79,7 +81,10 @@ mod tests {
         let anees = total / (6.0 * f64::from(runs));
         let (low, high) = anees_interval(6, runs as usize, 0.999);
         // To first order: turns of up to 0.3 rad bend what was moved by a hundredth.
-        assert!((low - 0.01..high + 0.01).contains(&anees), "{low} {anees} {high}");
+        assert!(
+            (low - 0.01..high + 0.01).contains(&anees),
+            "{low} {anees} {high}"
+        );
     }
 
     #[test]

@@ -121,7 +121,10 @@ impl KnownPose {
             return Err("covariance is none: not symmetric and positive".to_owned());
         }
         let rotation = UnitQuaternion::from_quaternion(quaternion);
-        Ok((Isometry3::from_parts(Translation3::from(position), rotation), cov))
+        Ok((
+            Isometry3::from_parts(Translation3::from(position), rotation),
+            cov,
+        ))
     }
 }
 
@@ -154,7 +157,11 @@ impl Legacy {
         let kept = match load(file) {
             Err(e) if e.kind() == io::ErrorKind::NotFound => return Self::default(),
             Err(e) => {
-                return afresh(0, None, &format!("the last pose cannot be read, the epoch begins with 0: {e}"));
+                return afresh(
+                    0,
+                    None,
+                    &format!("the last pose cannot be read, the epoch begins with 0: {e}"),
+                );
             }
             Ok(kept) => kept,
         };
@@ -173,7 +180,11 @@ impl Legacy {
                 warning: None,
                 pose: kept.pose,
             },
-            Err(why) => afresh(epoch, None, &format!("the last pose is not restored: {why}")),
+            Err(why) => afresh(
+                epoch,
+                None,
+                &format!("the last pose is not restored: {why}"),
+            ),
         }
     }
 }
@@ -185,7 +196,10 @@ fn load(file: &Path) -> io::Result<Kept> {
     let kept: Kept = toml::from_str(&text)
         .map_err(|e| damaged(format!("it is damaged: {}", e.message().trim_end())))?;
     if kept.version != VERSION {
-        return Err(damaged(format!("it has version {}, not {VERSION}", kept.version)));
+        return Err(damaged(format!(
+            "it has version {}, not {VERSION}",
+            kept.version
+        )));
     }
     if let Some(pose) = &kept.pose {
         pose.checked()
@@ -205,7 +219,10 @@ fn restore(
     let (odom_from_camera, cov_pose) = pose.checked()?;
     let age_s = (realtime_ns - pose.realtime_ns) as f64 * 1e-9;
     if age_s < 0.0 {
-        return Err(format!("it lies {:.0} s in the future: the clock has been set", -age_s));
+        return Err(format!(
+            "it lies {:.0} s in the future: the clock has been set",
+            -age_s
+        ));
     }
     if age_s > settings.max_age_s {
         return Err(format!(
@@ -307,7 +324,10 @@ impl Keeper {
         };
         let file = &self.0.file;
         save(file, &kept).map_err(|e| {
-            io::Error::other(format!("{}: the last pose cannot be kept: {e}", file.display()))
+            io::Error::other(format!(
+                "{}: the last pose cannot be kept: {e}",
+                file.display()
+            ))
         })
     }
 
@@ -325,7 +345,9 @@ fn save(file: &Path, kept: &Kept) -> io::Result<()> {
     new.write_all(text.as_bytes())?;
     new.sync_all()?;
     std::fs::rename(&beside, file)?;
-    let folder = file.parent().filter(|folder| !folder.as_os_str().is_empty());
+    let folder = file
+        .parent()
+        .filter(|folder| !folder.as_os_str().is_empty());
     File::open(folder.unwrap_or(Path::new(".")))?.sync_all()
 }
 
@@ -369,7 +391,9 @@ mod tests {
 
     /// A run that begins with what `legacy` says, gives these rows and ends.
     fn run(settings: &Settings, legacy: &Legacy, rows: &[Odometry]) {
-        let keeper = Keeper::start(settings, legacy).expect("writable").expect("wanted");
+        let keeper = Keeper::start(settings, legacy)
+            .expect("writable")
+            .expect("wanted");
         for row in rows {
             keeper.note(row, NOW_NS);
         }
@@ -383,7 +407,11 @@ mod tests {
         let first = Legacy::read(&settings, NOW_NS);
         assert!((first.epoch, first.start.is_none(), first.warning.is_none()) == (0, true, true));
         let tracked = row(Status::Tracking, 0);
-        run(&settings, &first, &[row(Status::Initializing, 0), tracked.clone()]);
+        run(
+            &settings,
+            &first,
+            &[row(Status::Initializing, 0), tracked.clone()],
+        );
         let next = Legacy::read(&settings, NOW_NS + 3 * SECOND_NS);
         assert_eq!((next.epoch, &next.warning), (1, &None));
         let start = next.start.expect("restored");
@@ -444,7 +472,10 @@ mod tests {
             let legacy = Legacy::read(&settings, NOW_NS);
             assert!(legacy.start.is_none() && legacy.epoch == 0, "{text}");
             let warning = legacy.warning.expect("one");
-            assert!(warning.contains(why) && warning.lines().count() == 1, "{warning}");
+            assert!(
+                warning.contains(why) && warning.lines().count() == 1,
+                "{warning}"
+            );
         }
     }
 
@@ -455,7 +486,10 @@ mod tests {
         settings.restore = false;
         run(&settings, &Legacy::default(), &[row(Status::Tracking, 4)]);
         let legacy = Legacy::read(&settings, NOW_NS + SECOND_NS);
-        assert_eq!((legacy.epoch, legacy.start.is_none(), legacy.warning), (5, true, None));
+        assert_eq!(
+            (legacy.epoch, legacy.start.is_none(), legacy.warning),
+            (5, true, None)
+        );
     }
 
     #[test]

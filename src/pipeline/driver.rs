@@ -354,10 +354,10 @@ fn collect<E>(
             let delivery = Delivery {
                 odometry: &outcome.odometry,
                 latencies: outcome.latencies,
-                unusable: outcome.fault.as_ref().map(|(stage, why)| Fault {
-                    stage: *stage,
-                    why,
-                }),
+                unusable: outcome
+                    .fault
+                    .as_ref()
+                    .map(|(stage, why)| Fault { stage: *stage, why }),
                 pair: outcome.buffers.used.as_ref(),
                 rig: method.rig_state(),
             };
@@ -440,5 +440,79 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 },
             })
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::features;
+    use crate::simulation::{
+        SceneName, Settings as Simulated, Simulation, TrajectoryName, small_rig,
+    };
+    use std::convert::Infallible;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    /// A source that always has one more pair, and counts those that it was asked for.
+    struct Eager {
+        pair: StereoPair,
+        is_live: bool,
+        asked_for: Arc<AtomicU64>,
+    }
+
+    impl PairSource for Eager {
+        fn next_event(&mut self) -> Option<PairEvent> {
+            let sequence = self.asked_for.fetch_add(1, Ordering::SeqCst);
+            Some(PairEvent::Pair(StereoPair {
+                sequence,
+                timestamp_ns: 100_000_000 * sequence as i64,
+                ..self.pair.clone()
+            }))
+        }
+
+        fn is_live(&self) -> bool {
+            self.is_live
+        }
+    }
+
+    /// The greatest number of pairs under way when a row comes, over 40 rows of which each takes its time.
+    fn most_under_way(is_live: bool, workers: usize) -> u64 {
+        let (scene, way) = (SceneName::Room, TrajectoryName::LoopRoom);
+        let simulation = Simulation::new(scene, way, small_rig(), Simulated::default());
+        let simulation = simulation.expect("fits");
+        let asked_for = Arc::new(AtomicU64::new(0));
+        let source = Eager {
+            pair: simulation.pair(0).0,
+            is_live,
+            asked_for: Arc::clone(&asked_for),
+        };
+        let mut settings = features::Settings::default();
+        settings.surf.budget = 50;
+        let extractors = (0..workers).map(|_| features::extractor(&settings).expect("valid"));
+        let mut method = Method::new(small_rig(), Default::default(), Default::default())
+            .expect("has a baseline");
+        let (mut rows, mut most) = (0, 0);
+        let run = run(source, extractors.collect(), &mut method, |_| {
+            // Long enough for all others to take what they may.
+            std::thread::sleep(Duration::from_millis(20));
+            most = most.max(asked_for.load(Ordering::SeqCst) - rows);
+            rows += 1;
+            Ok::<_, Infallible>(if rows < 40 {
+                ControlFlow::Continue(())
+            } else {
+                ControlFlow::Break(())
+            })
+        });
+        assert!(run.is_ok());
+        most
+    }
+
+    #[test]
+    fn live_pairs_wait_with_their_source_and_recorded_ones_in_the_pipeline() {
+        // The one whose row it is, and one in which features are looked for.
+        assert_eq!(most_under_way(true, 2), 2);
+        assert_eq!(most_under_way(true, 4), 3);
+        assert_eq!(most_under_way(false, 2), 4);
     }
 }

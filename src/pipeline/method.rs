@@ -8,9 +8,7 @@ use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
 use crate::estimation::sources::{Exposure, RigErrors};
-use crate::estimation::{
-    self, Counts, Odometer, Odometry, PairStamp, Start, StereoMeasurement,
-};
+use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, Start, StereoMeasurement};
 use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{

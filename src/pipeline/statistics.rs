@@ -1,7 +1,7 @@
 //! What a run came to: counts, latencies stage by stage, processor time and memory.
 
-use super::{Fault, Stage, StageLatencies};
 use super::histogram::Histogram;
+use super::{Fault, Stage, StageLatencies};
 use crate::estimation::{Odometry, Status};
 use serde::Serialize;
 use std::time::{Duration, Instant};

@@ -26,7 +26,10 @@ struct Arrival {
 fn main() -> Outcome {
     let seconds = words().first().map_or(Ok(60.0), |s| s.parse())?;
     for trim in [false, true] {
-        println!("\n### Overload, 320 × 240 px, trimming {}\n", if trim { "on" } else { "off" });
+        println!(
+            "\n### Overload, 320 × 240 px, trimming {}\n",
+            if trim { "on" } else { "off" }
+        );
         let more = format!("[service]\ntrim = {trim}\n");
         // Far more than can be handled: what comes out is how fast that is.
         let flood: Vec<f64> = (0..4000).map(|n| f64::from(n) / 400.0).collect();

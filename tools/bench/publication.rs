@@ -137,7 +137,9 @@ impl Listeners {
         publisher: &Publisher,
         count: usize,
     ) -> Result<Self, Box<dyn std::error::Error>> {
-        let processes = (0..count).map(|_| start_one(settings)).collect::<Result<_, _>>()?;
+        let processes = (0..count)
+            .map(|_| start_one(settings))
+            .collect::<Result<_, _>>()?;
         if !publisher.wait_for_subscribers(count, Duration::from_secs(20)) {
             return Err("the subscribers do not come".into());
         }

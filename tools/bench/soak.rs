@@ -31,13 +31,19 @@ impl Holdings {
             Ok(word.ok_or("the kernel does not tell")?.parse()?)
         };
         let ours = |entry: &std::fs::DirEntry| {
-            entry.file_name().to_string_lossy().starts_with("visod_bench_")
+            entry
+                .file_name()
+                .to_string_lossy()
+                .starts_with("visod_bench_")
         };
         Ok(Self {
             resident_kib: number("VmRSS:")?,
             threads: number("Threads:")?,
             descriptors: std::fs::read_dir(process.join("fd"))?.count(),
-            shared: std::fs::read_dir("/dev/shm")?.flatten().filter(ours).count(),
+            shared: std::fs::read_dir("/dev/shm")?
+                .flatten()
+                .filter(ours)
+                .count(),
         })
     }
 }
@@ -81,7 +87,10 @@ fn main() -> Fallible<()> {
         return Err("nothing arrives".into());
     };
     let grown = last.resident_kib as f64 / first.resident_kib as f64 - 1.0;
-    println!("\nmemory: {:+.2} % from a tenth of the way to its end", 1e2 * grown);
+    println!(
+        "\nmemory: {:+.2} % from a tenth of the way to its end",
+        1e2 * grown
+    );
     println!(
         "descriptors {:+}, shared memory files {:+}, threads {:+}",
         last.descriptors as i64 - first.descriptors as i64,
@@ -100,7 +109,8 @@ fn explain(summary: &serde_json::Value, lost: u64) {
     let dropped = count(&summary["dropped"]);
     let rows = count(&summary["pairs"]);
     let bridged = count(&summary["unusable_in_capture"]);
-    let unexplained = frames as i64 - (rows as i64 - bridged as i64) - dropped as i64 - unmatched as i64;
+    let unexplained =
+        frames as i64 - (rows as i64 - bridged as i64) - dropped as i64 - unmatched as i64;
     println!(
         "{frames} left frames: {} with a row, {dropped} dropped in the queue, {unmatched} without a partner, \
          {unexplained} unexplained; {rows} rows, {bridged} of them bridge what had no images; {} published, \

@@ -34,7 +34,11 @@ pub fn record(folder: &Path, times_s: &[f64]) -> Fallible<()> {
                 continue;
             }
             let pair = &recording.pairs[at as usize];
-            let image = if side == "left" { &pair.left } else { &pair.right };
+            let image = if side == "left" {
+                &pair.left
+            } else {
+                &pair.right
+            };
             let mut pgm = format!("P5\n{} {}\n255\n", image.width(), image.height()).into_bytes();
             pgm.extend_from_slice(image.pixels());
             std::fs::write(name(side, n), pgm)?;
