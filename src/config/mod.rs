@@ -50,10 +50,9 @@ impl Config {
     pub fn load(path: &Path) -> Result<Self, TomlError> {
         let mut config = Self::from_text(&TomlText::read(path)?)?;
         if let Some(folder) = path.parent() {
-            for file in [&mut config.rig, &mut config.last_pose.file] {
-                if let Some(file) = file {
-                    *file = folder.join(&*file);
-                }
+            let files = [&mut config.rig, &mut config.last_pose.file];
+            for file in files.into_iter().flatten() {
+                *file = folder.join(&*file);
             }
         }
         Ok(config)

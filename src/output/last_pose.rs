@@ -108,7 +108,8 @@ impl KnownPose {
     /// The pose and its covariance, if they are such.
     fn checked(&self) -> Result<(Isometry3<f64>, Matrix6<f64>), String> {
         let quaternion = Quaternion::from(self.quaternion_xyzw);
-        if !((quaternion.norm() - 1.0).abs() < MAX_LENGTH_ERROR) {
+        let is_of_length_one = (quaternion.norm() - 1.0).abs() < MAX_LENGTH_ERROR;
+        if !is_of_length_one {
             return Err("quaternion_xyzw is not of length 1".to_owned());
         }
         let position = Vector3::from(self.position_m);

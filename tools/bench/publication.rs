@@ -1,8 +1,8 @@
 //! How long a message takes to a subscriber in another process, and what eight of them, one that has been
 //! stopped and one that is killed over and over, cost the publisher: `cargo bench --bench publication`.
 //!
-//! Messages are published at 200 Hz, as a robot's cameras would at their fastest; the subscriber waits for
-//! events, as `visod listen` does, and does not poll.
+//! Messages are published at 200 Hz, as a robot's cameras would at their fastest. The subscribers wait for
+//! events, as `visod listen` does; one that polls instead shows what of the time is the waking up.
 
 mod common;
 
@@ -24,6 +24,8 @@ const PERIOD: Duration = Duration::from_millis(5);
 const MESSAGES: usize = 4000;
 /// Set in a process that is a subscriber.
 const ROOT: &str = "VISOD_BENCH_ROOT";
+/// Set where it does not wait for events.
+const POLLS: &str = "VISOD_BENCH_POLLS";
 
 type Outcome = Result<(), Box<dyn std::error::Error>>;
 
@@ -36,14 +38,16 @@ fn main() -> Outcome {
         "| subscribers | sending: median µs | p99 µs | max µs | arrival: median µs | p99 µs | max µs |"
     );
     println!("|---|---:|---:|---:|---:|---:|---:|");
-    measure("one", 1, |_| ())?;
-    measure("eight", 8, |_| ())?;
-    measure("eight, one of them stopped", 8, |listeners| {
+    measure("one, polling", 1, true, |_| ())?;
+    measure("one", 1, false, |_| ())?;
+    measure("eight", 8, false, |_| ())?;
+    measure("eight, one of them stopped", 8, false, |listeners| {
         listeners.stop_second();
     })?;
     measure(
         "eight, one stopped, one killed and started anew every 250 ms",
         8,
+        false,
         |listeners| {
             listeners.stop_second();
             listeners.replace_last();
@@ -83,11 +87,16 @@ fn message(sequence: u64) -> OdometryMessage {
 
 /// Publishes to `count` subscribers, and prints how long that took, and how long it took the first of them
 /// to have each message. `torment` is done to them every 250 ms.
-fn measure(name: &str, count: usize, torment: impl Fn(&mut Listeners) + Send) -> Outcome {
+fn measure(
+    name: &str,
+    count: usize,
+    polls: bool,
+    torment: impl Fn(&mut Listeners) + Send,
+) -> Outcome {
     let folder = tempfile::tempdir()?;
     let settings = settings(folder.path().join("iox"));
     let mut publisher = Publisher::new(&settings)?;
-    let mut listeners = Listeners::start(&settings, &publisher, count)?;
+    let mut listeners = Listeners::start(&settings, &publisher, count, polls)?;
     let over = AtomicBool::new(false);
     let mut sending = Vec::with_capacity(MESSAGES);
     let sent = std::thread::scope(|scope| {
@@ -136,9 +145,10 @@ impl Listeners {
         settings: &Settings,
         publisher: &Publisher,
         count: usize,
+        polls: bool,
     ) -> Result<Self, Box<dyn std::error::Error>> {
         let processes = (0..count)
-            .map(|_| start_one(settings))
+            .map(|_| start_one(settings, polls))
             .collect::<Result<_, _>>()?;
         if !publisher.wait_for_subscribers(count, Duration::from_secs(20)) {
             return Err("the subscribers do not come".into());
@@ -157,7 +167,8 @@ impl Listeners {
 
     /// Kills the last and starts it anew.
     fn replace_last(&mut self) {
-        if let (Some(mut last), Ok(new)) = (self.processes.pop(), start_one(&self.settings)) {
+        if let (Some(mut last), Ok(new)) = (self.processes.pop(), start_one(&self.settings, false))
+        {
             let _ = last.kill();
             let _ = last.wait();
             self.processes.push(new);
@@ -180,20 +191,23 @@ impl Listeners {
     }
 }
 
-fn start_one(settings: &Settings) -> std::io::Result<Child> {
+fn start_one(settings: &Settings, polls: bool) -> std::io::Result<Child> {
     let root = settings.root.clone().unwrap_or_default();
-    Command::new(std::env::current_exe()?)
-        .env(ROOT, root)
-        .stdout(Stdio::piped())
-        .spawn()
+    let mut command = Command::new(std::env::current_exe()?);
+    if polls {
+        command.env(POLLS, "yes");
+    }
+    command.env(ROOT, root).stdout(Stdio::piped()).spawn()
 }
 
 /// Receives until the last message, then prints how long each took, ns.
 fn subscribe(settings: &Settings) -> Outcome {
     let mut subscriber = OdometrySubscriber::new("bench", settings)?;
     let mut took = Vec::with_capacity(MESSAGES);
+    let polls = std::env::var_os(POLLS).is_some();
     // One that comes late, or is never killed, ends some time.
-    while subscriber.wait(Duration::from_secs(20))? == Wake::Message {
+    let patience = Duration::from_secs(20);
+    while polls || subscriber.wait(patience)? == Wake::Message {
         let mut is_last = false;
         while let Some(received) = subscriber.receive()? {
             took.push(monotonic_ns() - received.message.published_monotonic_ns);
