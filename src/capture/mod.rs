@@ -108,6 +108,12 @@ pub trait PairSource: Send {
         None
     }
 
+    /// Whether pairs come whether or not anybody is ready for them, so that one that waits in the pipeline is
+    /// worth less than the one that comes after it.
+    fn is_live(&self) -> bool {
+        false
+    }
+
     /// Says before the first event how many pairs the consumer will hold at once, so that memory for
     /// them is taken now rather than when there are as many for the first time.
     ///

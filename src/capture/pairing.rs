@@ -57,15 +57,44 @@ pub enum WhyUnmatched {
 }
 
 impl WhyUnmatched {
+    /// The words for tables, in the order in which [`Unmatched`] counts.
+    const WORDS: [&str; 4] = ["too_far", "no_such_trigger", "other_silent", "reopened"];
+
     /// A word for tables.
     #[must_use]
     pub fn as_str(self) -> &'static str {
+        Self::WORDS[self.place()]
+    }
+
+    fn place(&self) -> usize {
         match self {
-            Self::TooFar { .. } => "too_far",
-            Self::NoSuchTrigger => "no_such_trigger",
-            Self::OtherSilent => "other_silent",
-            Self::Reopened => "reopened",
+            Self::TooFar { .. } => 0,
+            Self::NoSuchTrigger => 1,
+            Self::OtherSilent => 2,
+            Self::Reopened => 3,
         }
+    }
+}
+
+/// Frames without a partner, counted by reason.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Unmatched([u64; WhyUnmatched::WORDS.len()]);
+
+impl Unmatched {
+    /// Counts one.
+    pub fn add(&mut self, why: &WhyUnmatched) {
+        self.0[why.place()] += 1;
+    }
+
+    /// How many there are.
+    #[must_use]
+    pub fn total(&self) -> u64 {
+        self.0.iter().sum()
+    }
+
+    /// Each reason, in a word, with its count.
+    pub fn iter(&self) -> impl Iterator<Item = (&'static str, u64)> + '_ {
+        WhyUnmatched::WORDS.into_iter().zip(self.0)
     }
 }
 

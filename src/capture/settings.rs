@@ -35,8 +35,8 @@ pub struct Settings {
     /// How long a start waits for cameras that are absent or held by another program. s, 0 to 3600,
     /// default 10: a camera lets go of a killed daemon only after some seconds.
     pub patience_s: f64,
-    /// Pairs that wait for the stages before the oldest is dropped. Pairs, 1 to 64, default 2: rides out
-    /// a slow pair, and no more, for a fresh pair is worth more than an old one.
+    /// Pairs that wait for the stages before the oldest is dropped. Pairs, 1 to 64, default 1: a fresh pair is
+    /// worth more than an old one.
     pub queue: usize,
 }
 
@@ -73,7 +73,7 @@ impl Default for Settings {
             stall_s: 2.0,
             retry_s: 0.5,
             patience_s: 10.0,
-            queue: 2,
+            queue: 1,
         }
     }
 }

@@ -4,6 +4,7 @@ use super::Failure;
 use crate::capture::camera::monotonic_ns;
 use crate::capture::live::{Monitor, Snapshot, State};
 use crate::config::Config;
+use crate::output::last_pose::Keeper;
 use crate::service::notify::Manager;
 use crate::service::vitals::{CameraSigns, Limits, Signs, judge};
 use crate::service::{self, realtime};
@@ -86,13 +87,21 @@ impl Attendant {
     }
 
     /// Looks after the run of `cameras` on a thread of its own, which ends after the run has.
-    pub(crate) fn attend(mut self, cameras: Monitor) -> Result<JoinHandle<()>, Failure> {
+    /// Meanwhile `keeper` keeps the last pose.
+    pub(crate) fn attend(
+        mut self,
+        cameras: Monitor,
+        keeper: Option<Keeper>,
+    ) -> Result<JoinHandle<()>, Failure> {
         let heartbeat = Manager::heartbeat().map_or(GLANCE, |period| period.min(GLANCE));
         std::thread::Builder::new()
             .name("attendant".to_owned())
             .spawn(move || {
                 while !cameras.waits_out(heartbeat) {
                     self.look(&cameras.snapshot());
+                    if let Some(Err(e)) = keeper.as_ref().map(Keeper::write_if_due) {
+                        tracing::warn!("{e}");
+                    }
                 }
                 self.manager.stopping();
             })

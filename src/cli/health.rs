@@ -17,6 +17,7 @@ pub(crate) struct Health {
     started: Instant,
     message: HealthMessage,
     status: Option<Status>,
+    first_epoch: Option<u32>,
     changed: bool,
     published: Option<Instant>,
     busy_total: Duration,
@@ -30,6 +31,7 @@ impl Default for Health {
             started: Instant::now(),
             message: HealthMessage::default(),
             status: None,
+            first_epoch: None,
             changed: false,
             published: None,
             busy_total: Duration::ZERO,
@@ -50,7 +52,8 @@ impl Health {
         let ns = |d: Duration| u64::try_from(d.as_nanos()).unwrap_or(u64::MAX);
         let m = &mut self.message;
         m.odometry_status = status_code(odometry.status);
-        m.restarts = u64::from(odometry.epoch);
+        let first_epoch = *self.first_epoch.get_or_insert(odometry.epoch);
+        m.restarts = u64::from(odometry.epoch.saturating_sub(first_epoch));
         m.pairs_processed += 1;
         m.left_state = CameraState::Streaming as u32;
         m.right_state = CameraState::Streaming as u32;
@@ -107,7 +110,7 @@ impl Health {
         (m.left_lost_in_transport, m.right_lost_in_transport) =
             (left.losses.in_transport(), right.losses.in_transport());
         (m.left_unreadable, m.right_unreadable) = (left.losses.unusable(), right.losses.unusable());
-        (m.left_unmatched, m.right_unmatched) = (left.unmatched, right.unmatched);
+        (m.left_unmatched, m.right_unmatched) = (left.unmatched.total(), right.unmatched.total());
         m.pairs_dropped = cameras.dropped;
     }
 

@@ -14,6 +14,7 @@ mod features;
 mod health;
 mod listen;
 mod live;
+mod metrics;
 mod montecarlo;
 mod progress;
 mod record;

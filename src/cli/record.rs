@@ -113,7 +113,7 @@ fn print(args: &Args, recorder: &Recorder, cameras: &Snapshot) -> Result<(), Fai
         dropped: cameras.pairs - recorder.count(),
         frames: of(|c| c.frames),
         written: [recorder.count(); 2],
-        unmatched: of(|c| c.unmatched),
+        unmatched: of(|c| c.unmatched.total()),
         lost: of(|c| c.losses.in_transport() + c.losses.unusable()),
         clocks: cameras.cameras.each_ref().map(|c| c.clock),
     };

@@ -4,7 +4,9 @@ use super::attendant::{Attendant, ask_for_resources};
 use super::live::{Setup, Stop};
 use super::session::{Session, unwritable};
 use super::{Failure, summary};
+use crate::capture::camera::realtime_ns;
 use crate::capture::live::{Delivery, Overflow};
+use crate::output::last_pose::{Keeper, Legacy};
 use crate::service::log;
 use std::path::PathBuf;
 
@@ -52,7 +54,20 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let setup = Setup::load(&args.config)?;
     let attendant = Attendant::new(args.config.clone(), setup.config.clone())?;
     ask_for_resources(&setup.config.service);
+    let legacy = Legacy::read(&setup.config.last_pose, realtime_ns());
+    if let Some(warning) = &legacy.warning {
+        tracing::warn!("{warning}");
+    } else if legacy.start.is_some() {
+        let epoch = legacy.epoch;
+        tracing::info!(epoch, "the odometry frame of the run before is continued");
+    }
+    // A robot whose disk is full drives on.
+    let keeper = Keeper::start(&setup.config.last_pose, &legacy).unwrap_or_else(|e| {
+        tracing::warn!("{e}");
+        None
+    });
     let mut session = Session::new(setup.config.clone(), setup.rig.clone());
+    session.continuing(legacy, keeper.clone());
     session.write_csv(args.odometry.as_deref())?;
     session.write_trajectory(args.trajectory.as_deref())?;
     if !args.no_publish {
@@ -65,15 +80,19 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     };
     let source = setup.open(delivery, &stop)?;
     session.watch(source.monitor(), attendant.pulse());
+    session.serve_metrics()?;
     session.write_mcap(args.mcap.as_deref())?;
     if let Some(rows) = args.hang_after {
         session.on_each_row(hang_after(rows));
     }
-    let attending = attendant.attend(source.monitor())?;
+    let attending = attendant.attend(source.monitor(), keeper.clone())?;
     stop.end_run(source.monitor(), args.seconds)?;
     let finished = session.run(source);
     // The last thing that systemd is told; a panic in it has been reported already.
     let _ = attending.join();
+    if let Some(Err(e)) = keeper.as_ref().map(Keeper::write) {
+        tracing::warn!("{e}");
+    }
     let finished = finished?;
     let json = summary::to_json(&args.config, &finished).map_err(Failure::other)?;
     if let Some(file) = &args.summary {

@@ -3,22 +3,28 @@
 use super::attendant::Pulse;
 #[cfg(feature = "ipc")]
 use super::health::Health;
+use super::metrics::{Metrics, Totals};
 use super::{Failure, progress, summary};
 use crate::capture::PairSource;
+use crate::capture::camera::realtime_ns;
 use crate::capture::live::{Monitor, Snapshot};
 use crate::config::Config;
 use crate::features;
 use crate::geometry::{Severity, StereoRig, check_rig};
 use crate::output::csv::OdometryCsvWriter;
+use crate::output::last_pose::{Keeper, Legacy};
 #[cfg(feature = "mcap")]
 use crate::output::mcap::McapRecorder;
 #[cfg(feature = "ipc")]
 use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
-use crate::pipeline::{self, Delivery, Method, RunFigures, Share, Statistics};
+use crate::pipeline::{
+    self, Delivery, DropCount, Fault, Method, RunCounts, RunFigures, Share, Statistics,
+};
 use crate::rig_watch::RigState;
 use crate::service::budget::{FrameBudget, Timing};
+use crate::service::metrics::Exposition;
 use indicatif::ProgressBar;
 use std::fs::File;
 use std::io;
@@ -46,6 +52,9 @@ pub(crate) struct Session {
     publish_failures: u64,
     each_row: Option<RowWatcher>,
     live: Option<Live>,
+    metrics: Option<(Metrics, Exposition)>,
+    legacy: Legacy,
+    keeper: Option<Keeper>,
     warned_of_first_order: bool,
     warned_of_rig: [bool; 2],
 }
@@ -76,6 +85,8 @@ pub(crate) struct Finished {
     pub(crate) cameras: Option<Snapshot>,
     /// How the rig is, where it was watched.
     pub(crate) rig: Option<RigState>,
+    /// All that was lost on the way.
+    pub(crate) drops: Vec<DropCount>,
 }
 
 impl Session {
@@ -107,6 +118,9 @@ impl Session {
             publish_failures: 0,
             each_row: None,
             live: None,
+            metrics: None,
+            legacy: Legacy::default(),
+            keeper: None,
             warned_of_first_order: false,
             warned_of_rig: [false; 2],
         }
@@ -122,6 +136,20 @@ impl Session {
             budget: FrameBudget::new(service.deadline(), service.trim),
             share: Share::default(),
         });
+    }
+
+    /// Answers those who fetch figures, where the configuration says so; after [`watch`](Self::watch).
+    pub(crate) fn serve_metrics(&mut self) -> Result<(), Failure> {
+        if let Some(live) = &self.live {
+            self.metrics = Metrics::serve(&self.config, live.cameras.clone())?;
+        }
+        Ok(())
+    }
+
+    /// Continues what an earlier run has left, and has `keeper` know where this one stands.
+    pub(crate) fn continuing(&mut self, legacy: Legacy, keeper: Option<Keeper>) {
+        self.legacy = legacy;
+        self.keeper = keeper;
     }
 
     /// Writes the odometry CSV.
@@ -192,7 +220,8 @@ impl Session {
         .ok_or_else(|| {
             Failure::usage("the rig's cameras stand behind one another: no depth can be measured")
         })?
-        .watching_rig(&self.config.rig_watch);
+        .watching_rig(&self.config.rig_watch)
+        .continuing(self.legacy.epoch, self.legacy.start.take());
         let share = self.live.as_ref().map(|live| live.share.clone());
         let bound = |extractor| match &share {
             Some(share) => share.bound(extractor),
@@ -207,12 +236,8 @@ impl Session {
         let mut first_unusable = None;
         let mut last = None;
         pipeline::run(source, extractors, &mut method, |delivery| {
-            statistics.add(
-                delivery.odometry,
-                &delivery.latencies,
-                delivery.unusable.is_none(),
-            );
-            if let Some(why) = delivery.unusable {
+            statistics.add(delivery.odometry, &delivery.latencies, delivery.unusable);
+            if let Some(Fault { why, .. }) = delivery.unusable {
                 let sequence = delivery.odometry.sequence;
                 // Cameras say themselves what happens to them, once and not for each pair.
                 match self.live {
@@ -226,6 +251,7 @@ impl Session {
             self.warn_of_first_order(&delivery, &bar);
             self.warn_of_rig(&delivery, &bar);
             last = Some(self.deliver(&delivery, &bar)?);
+            self.show(&delivery, statistics.counts());
             bar.inc(1);
             Ok::<_, io::Error>(ControlFlow::Continue(()))
         })
@@ -257,6 +283,7 @@ impl Session {
         let mut figures = statistics.figures();
         figures.counts.dropped = cameras.as_ref().map_or(0, |c| c.dropped);
         Ok(Finished {
+            drops: pipeline::drops(cameras.as_ref(), &figures.counts, self.publish_failures),
             figures,
             cameras,
             rows: self.rows.unwrap_or_default(),
@@ -324,6 +351,10 @@ impl Session {
             live.see(delivery);
         }
         self.send(delivery);
+        if let Some(keeper) = &self.keeper {
+            let age_ns = i64::try_from(delivery.latencies.total.as_nanos()).unwrap_or(0);
+            keeper.note(delivery.odometry, realtime_ns() - age_ns);
+        }
         if let Some((file, csv)) = &mut self.csv {
             csv.write_row(&row)
                 .and_then(|()| csv.flush())
@@ -346,6 +377,27 @@ impl Session {
             rows.push(row.clone());
         }
         Ok(row)
+    }
+
+    /// Leaves the totals up to a row to those who fetch figures.
+    fn show(&self, delivery: &Delivery<'_>, counts: &RunCounts) {
+        let (Some((metrics, _)), Some(live)) = (&self.metrics, &self.live) else {
+            return;
+        };
+        #[cfg(feature = "ipc")]
+        let subscribers = self.publisher.as_ref().map_or(0, Publisher::subscribers);
+        #[cfg(not(feature = "ipc"))]
+        let subscribers = 0;
+        let totals = Totals {
+            counts: *counts,
+            published: self.published,
+            publish_failures: self.publish_failures,
+            subscribers,
+            overruns: live.budget.overruns(),
+            over_period: live.budget.over_period(),
+            share: live.budget.share(),
+        };
+        metrics.add(delivery, totals);
     }
 
     #[cfg(feature = "ipc")]
@@ -390,7 +442,7 @@ impl Session {
     /// When a pair was taken, and how long it took to be complete, ns.
     #[cfg(feature = "ipc")]
     fn captured(&self, delivery: &Delivery<'_>) -> (crate::output::message::CaptureTime, u64) {
-        use crate::capture::camera::{monotonic_ns, realtime_ns};
+        use crate::capture::camera::monotonic_ns;
         use crate::output::message::CaptureTime;
 
         let odometry = delivery.odometry;

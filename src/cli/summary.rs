@@ -6,6 +6,7 @@ use crate::capture::live::{CameraStatus, Snapshot};
 use crate::evaluation::{self, Trajectory};
 use crate::output::report;
 use crate::output::row::OdometryRow;
+use crate::pipeline::DropCount;
 use crate::rig_watch::RigState;
 use std::fmt::Write;
 use std::path::Path;
@@ -18,6 +19,7 @@ struct Summary<'a> {
     figures: &'a crate::pipeline::RunFigures,
     published: u64,
     publish_failures: u64,
+    drops: Vec<&'a DropCount>,
     end_position_m: Option<[f64; 3]>,
     end_sigma_m: Option<[f64; 3]>,
     #[serde(skip_serializing_if = "Option::is_none")]
@@ -48,7 +50,7 @@ impl<'a> CameraSummary<'a> {
             identity: &camera.identity,
             state: camera.state.as_str(),
             frames: camera.frames,
-            unmatched: camera.unmatched,
+            unmatched: camera.unmatched.total(),
             reconnects: camera.reconnects,
             clock_steps: camera.clock_steps,
             clock: camera.clock,
@@ -69,7 +71,7 @@ pub(crate) fn cameras_to_text(cameras: &Snapshot) -> String {
             "  {side:<6} {}: {} frames, {} unmatched{}, opened anew {} times",
             camera.identity,
             camera.frames,
-            camera.unmatched,
+            camera.unmatched.total(),
             lost.concat(),
             camera.reconnects
         );
@@ -110,6 +112,7 @@ pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result
         figures: &finished.figures,
         published: finished.published,
         publish_failures: finished.publish_failures,
+        drops: occurred(finished).collect(),
         end_position_m: finished.last.as_ref().map(position_m),
         end_sigma_m: finished.last.as_ref().map(sigma_m),
         rig: finished.rig,
@@ -121,6 +124,11 @@ pub(crate) fn to_json(dataset: &Path, finished: &Finished) -> serde_json::Result
             ]
         }),
     })
+}
+
+/// What was lost at all.
+fn occurred(finished: &Finished) -> impl Iterator<Item = &DropCount> {
+    finished.drops.iter().filter(|drop| drop.count > 0)
 }
 
 /// The summary for a person.
@@ -153,6 +161,15 @@ pub(crate) fn to_text(finished: &Finished) -> String {
             "  {:<10} median {:>8.2} ms   p99 {:>8.2} ms",
             stage.stage, stage.median, stage.p99
         );
+    }
+    for drop in occurred(finished) {
+        let DropCount {
+            stage,
+            reason,
+            camera,
+            count,
+        } = drop;
+        let _ = writeln!(text, "  lost in {stage}: {count} {reason} ({camera})");
     }
     if let Some(rig) = &finished.rig {
         let _ = writeln!(text, "  rig: {}", rig_to_text(rig));

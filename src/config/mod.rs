@@ -33,8 +33,12 @@ pub struct Config {
     pub pipeline: pipeline::Settings,
     /// Where the results are published.
     pub publish: output::publication::Settings,
+    /// What is kept for the next run.
+    pub last_pose: output::last_pose::Settings,
     /// How the daemon behaves as a service.
     pub service: service::Settings,
+    /// Where figures can be fetched.
+    pub metrics: service::metrics::Settings,
 }
 
 impl Config {
@@ -45,8 +49,11 @@ impl Config {
     /// of range.
     pub fn load(path: &Path) -> Result<Self, TomlError> {
         let mut config = Self::from_text(&TomlText::read(path)?)?;
-        if let (Some(rig), Some(folder)) = (&mut config.rig, path.parent()) {
-            *rig = folder.join(&*rig);
+        if let Some(folder) = path.parent() {
+            let files = [&mut config.rig, &mut config.last_pose.file];
+            for file in files.into_iter().flatten() {
+                *file = folder.join(&*file);
+            }
         }
         Ok(config)
     }
@@ -75,7 +82,9 @@ impl Config {
             ("rig_watch", config.rig_watch.check()),
             ("pipeline", config.pipeline.check()),
             ("publish", config.publish.check()),
+            ("last_pose", config.last_pose.check()),
             ("service", config.service.check()),
+            ("metrics", config.metrics.check()),
         ] {
             checked.map_err(|SettingError { key, cause }| {
                 text.wrong(&format!("{table}.{key}"), cause)

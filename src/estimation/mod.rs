@@ -15,6 +15,7 @@ mod settings;
 mod sight;
 pub mod sources;
 mod standing;
+mod start;
 #[cfg(test)]
 mod synthetic;
 pub mod track_noise;
@@ -28,6 +29,7 @@ pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
 pub use odometer::{Odometer, PairStamp, Place};
 pub use settings::{Method, Settings};
 pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
+pub use start::Start;
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
 
 use nalgebra::{Isometry3, Matrix6, Vector6};

@@ -8,11 +8,13 @@
 use super::closed_form::MotionEstimate;
 use super::sources::{BySources, Exposure, RigErrors};
 use super::standing::Standing;
+use super::start::Start;
 use super::window::Tracked;
 use super::{Counts, ErrorBudget, FLAT_LIMIT, MeasuredMotion, Odometry, Settings, Status};
 use crate::geometry::se3;
 use crate::uncertainty::{compounding, consider};
 use nalgebra::{Isometry3, Matrix6, Vector6};
+use std::time::Instant;
 
 /// The origin is a pose by definition; its covariance only has to be positive definite: (1 µm)²,
 /// (1 µrad)².
@@ -57,6 +59,8 @@ pub struct Odometer {
     settings: Settings,
     errors: RigErrors,
     epoch: u32,
+    /// Where it begins, if not at the origin.
+    start: Option<Start>,
     reference: Place,
     last: Place,
     /// From the reference to the last row: what bridging has added since.
@@ -84,6 +88,7 @@ impl Odometer {
             settings,
             errors,
             epoch: 0,
+            start: None,
             reference: origin,
             last: origin,
             reference_from_last: no_motion(),
@@ -92,6 +97,15 @@ impl Odometer {
             tracked_in_epoch: false,
             variance_factor: 1.0,
         }
+    }
+
+    /// Continues the frame of an earlier run, if there is one, as its epoch `epoch`. How far the robot may have
+    /// moved meanwhile counts as bridged.
+    #[must_use]
+    pub fn continuing(mut self, epoch: u32, start: Option<Start>) -> Self {
+        self.epoch = epoch;
+        self.start = start;
+        self
     }
 
     /// The variance factor to expect of the next motion.
@@ -118,6 +132,10 @@ impl Odometer {
     /// nothing has been tracked yet.
     pub fn begin(&mut self, stamp: PairStamp, counts: Counts) -> Odometry {
         self.reference.timestamp_ns = stamp.timestamp_ns;
+        if let Some(start) = &self.start {
+            self.reference.odom_from_camera = start.odom_from_camera;
+            self.reference.bridging = start.cov_right(Instant::now());
+        }
         self.last = self.reference;
         self.reference_from_last = no_motion();
         self.bridged = 0;
@@ -297,6 +315,8 @@ impl Odometer {
         self.velocity = unknown_velocity();
         self.bridged = 0;
         self.tracked_in_epoch = false;
+        // The pose that the new epoch begins with is the bridged one.
+        self.start = None;
         self.standing.begin();
         row.epoch = self.epoch;
         row.status = Status::Initializing;

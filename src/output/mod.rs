@@ -7,6 +7,7 @@
 //! | `publisher`, `subscriber` (feature `ipc`) | those layouts to and from iceoryx2 services |
 //! | [`row`], [`csv`], [`json`] | one odometry estimate as a row or an object, number for number the same text |
 //! | `mcap` (feature `mcap`) | a recording that ROS 2 and Foxglove read |
+//! | [`last_pose`] | where a run ended, for the next one |
 //! | [`report`] | one HTML page about a run |
 //! | [`tum`] | the trajectory for other tools |
 
@@ -15,6 +16,7 @@ pub mod health;
 #[cfg(feature = "ipc")]
 mod ipc;
 pub mod json;
+pub mod last_pose;
 #[cfg(feature = "mcap")]
 pub mod mcap;
 pub mod message;

@@ -72,11 +72,31 @@ pub struct Delivery<'a> {
     /// How long it took; zero for a pair that was not usable.
     pub latencies: StageLatencies,
     /// Why the pair was not usable, where it was not.
-    pub unusable: Option<&'a str>,
+    pub unusable: Option<Fault<'a>>,
     /// The images, where there are both.
     pub pair: Option<&'a StereoPair>,
     /// How the rig is, where it is watched.
     pub rig: Option<RigState>,
+}
+
+/// Why a pair could not be used, and who found out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Fault<'a> {
+    /// The stage that it got no further than.
+    pub stage: Stage,
+    /// The reason, for a person.
+    pub why: &'a str,
+}
+
+/// The stages that a pair may fail in.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Stage {
+    /// Its images never came, or cannot be read.
+    Capture,
+    /// No features could be looked for.
+    Features,
+    /// Its features could not be matched.
+    Matching,
 }
 
 /// Why a run ended early.
@@ -93,11 +113,22 @@ pub enum PipelineError<E> {
     Worker,
 }
 
-/// Pairs under way at once, beyond one a worker.
+/// Pairs under way at once, beyond one a worker: no thread ever waits for another's buffers.
 const SLACK_PAIRS: usize = 2;
 
+/// How many pairs may be under way at once. Of live ones only as many as are worked on, one by the method and
+/// the others by two workers each: when the stages are late, pairs wait with the source, which drops the
+/// stalest, and not in here, where each that waits makes all that follow later.
+fn pairs_under_way(is_live: bool, workers: usize) -> usize {
+    if is_live {
+        1 + workers.div_ceil(2)
+    } else {
+        workers + SLACK_PAIRS
+    }
+}
+
 /// Carries every pair of `source` through `method` and hands each row to `deliver`, in order,
-/// until the source ends or `deliver` breaks off. No pair is dropped.
+/// until the source ends or `deliver` breaks off. No pair is dropped here.
 ///
 /// `extractors` holds one for each feature worker, all alike.
 ///
@@ -110,7 +141,7 @@ pub fn run<S: PairSource, E>(
     mut deliver: impl FnMut(Delivery<'_>) -> Result<ControlFlow<()>, E>,
 ) -> Result<(), PipelineError<E>> {
     prepare_thread();
-    let under_way = extractors.len() + SLACK_PAIRS;
+    let under_way = pairs_under_way(source.is_live(), extractors.len());
     source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
     let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);
@@ -323,7 +354,10 @@ fn collect<E>(
             let delivery = Delivery {
                 odometry: &outcome.odometry,
                 latencies: outcome.latencies,
-                unusable: outcome.unusable.as_deref(),
+                unusable: outcome
+                    .fault
+                    .as_ref()
+                    .map(|(stage, why)| Fault { stage: *stage, why }),
                 pair: outcome.buffers.used.as_ref(),
                 rig: method.rig_state(),
             };
@@ -344,7 +378,7 @@ fn collect<E>(
 struct Outcome {
     odometry: Odometry,
     latencies: StageLatencies,
-    unusable: Option<String>,
+    fault: Option<(Stage, String)>,
     buffers: Spare,
 }
 
@@ -360,7 +394,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
             Some(Outcome {
                 odometry: method.skip(stamp),
                 latencies: StageLatencies::default(),
-                unusable: Some(unusable.why),
+                fault: Some((Stage::Capture, unusable.why)),
                 buffers,
             })
         }
@@ -374,12 +408,14 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 right: right.job.described,
             };
             let stepped = match left.failed.or(right.failed) {
-                Some(why) => Err(why),
-                None => method.step(described).map_err(|e| e.to_string()),
+                Some(why) => Err((Stage::Features, why)),
+                None => method
+                    .step(described)
+                    .map_err(|e| (Stage::Matching, e.to_string())),
             };
-            let (odometry, unusable) = match stepped {
+            let (odometry, fault) = match stepped {
                 Ok(odometry) => (odometry, None),
-                Err(why) => (method.skip(stamp), Some(why)),
+                Err(fault) => (method.skip(stamp), Some(fault)),
             };
             let times = method.times();
             Some(Outcome {
@@ -390,7 +426,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                     estimation: times.estimation,
                     total: left.job.arrived.elapsed(),
                 },
-                unusable,
+                fault,
                 buffers: Spare {
                     used: Some(StereoPair {
                         sequence: stamp.sequence,
@@ -404,5 +440,79 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 },
             })
         }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::features;
+    use crate::simulation::{
+        SceneName, Settings as Simulated, Simulation, TrajectoryName, small_rig,
+    };
+    use std::convert::Infallible;
+    use std::sync::Arc;
+    use std::sync::atomic::{AtomicU64, Ordering};
+
+    /// A source that always has one more pair, and counts those that it was asked for.
+    struct Eager {
+        pair: StereoPair,
+        is_live: bool,
+        asked_for: Arc<AtomicU64>,
+    }
+
+    impl PairSource for Eager {
+        fn next_event(&mut self) -> Option<PairEvent> {
+            let sequence = self.asked_for.fetch_add(1, Ordering::SeqCst);
+            Some(PairEvent::Pair(StereoPair {
+                sequence,
+                timestamp_ns: 100_000_000 * sequence as i64,
+                ..self.pair.clone()
+            }))
+        }
+
+        fn is_live(&self) -> bool {
+            self.is_live
+        }
+    }
+
+    /// The greatest number of pairs under way when a row comes, over 40 rows of which each takes its time.
+    fn most_under_way(is_live: bool, workers: usize) -> u64 {
+        let (scene, way) = (SceneName::Room, TrajectoryName::LoopRoom);
+        let simulation = Simulation::new(scene, way, small_rig(), Simulated::default());
+        let simulation = simulation.expect("fits");
+        let asked_for = Arc::new(AtomicU64::new(0));
+        let source = Eager {
+            pair: simulation.pair(0).0,
+            is_live,
+            asked_for: Arc::clone(&asked_for),
+        };
+        let mut settings = features::Settings::default();
+        settings.surf.budget = 50;
+        let extractors = (0..workers).map(|_| features::extractor(&settings).expect("valid"));
+        let mut method = Method::new(small_rig(), Default::default(), Default::default())
+            .expect("has a baseline");
+        let (mut rows, mut most) = (0, 0);
+        let run = run(source, extractors.collect(), &mut method, |_| {
+            // Long enough for all others to take what they may.
+            std::thread::sleep(Duration::from_millis(20));
+            most = most.max(asked_for.load(Ordering::SeqCst) - rows);
+            rows += 1;
+            Ok::<_, Infallible>(if rows < 40 {
+                ControlFlow::Continue(())
+            } else {
+                ControlFlow::Break(())
+            })
+        });
+        assert!(run.is_ok());
+        most
+    }
+
+    #[test]
+    fn live_pairs_wait_with_their_source_and_recorded_ones_in_the_pipeline() {
+        // The one whose row it is, and one in which features are looked for.
+        assert_eq!(most_under_way(true, 2), 2);
+        assert_eq!(most_under_way(true, 4), 3);
+        assert_eq!(most_under_way(false, 2), 4);
     }
 }

@@ -8,7 +8,7 @@ use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
 use crate::estimation::sources::{Exposure, RigErrors};
-use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, StereoMeasurement};
+use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, Start, StereoMeasurement};
 use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{
@@ -98,6 +98,8 @@ pub(super) struct Workbench {
     pub(super) matched: Option<Instant>,
     /// Whether the rig is still as calibrated.
     pub(super) watch: Option<RigWatch>,
+    /// The epoch that the first pair begins, and where, if not at the origin.
+    beginning: (u32, Option<Start>),
 }
 
 enum Estimator {
@@ -142,6 +144,7 @@ impl Method {
             odometer: None,
             matched: None,
             watch: None,
+            beginning: (0, None),
         };
         Some(Self {
             bench,
@@ -154,6 +157,13 @@ impl Method {
     #[must_use]
     pub fn watching_rig(mut self, settings: &rig_watch::Settings) -> Self {
         self.bench.watch = RigWatch::new(&self.bench.rig, settings, &self.bench.estimation);
+        self
+    }
+
+    /// Begins with the given epoch, and where an earlier run ended, if that is known. Before the first pair.
+    #[must_use]
+    pub fn continuing(mut self, epoch: u32, start: Option<Start>) -> Self {
+        self.bench.beginning = (epoch, start);
         self
     }
 
@@ -275,7 +285,8 @@ impl Workbench {
 
     /// An odometer that begins with a pair.
     pub(super) fn new_odometer(&self, stamp: PairStamp) -> Odometer {
-        Odometer::new(self.estimation.clone(), self.errors.clone(), stamp)
+        let (epoch, start) = self.beginning.clone();
+        Odometer::new(self.estimation.clone(), self.errors.clone(), stamp).continuing(epoch, start)
     }
 
     pub(super) fn counts(&self, inliers: u32) -> Counts {

@@ -1,6 +1,7 @@
 //! Pipeline: the method itself, and the threads that carry pairs through it.
 
 mod driver;
+mod drops;
 #[cfg(test)]
 mod estimator_tests;
 mod gallery;
@@ -12,7 +13,8 @@ mod trim;
 mod two_frame;
 mod windowed;
 
-pub use driver::{Delivery, PipelineError, Settings, StageLatencies, run};
+pub use driver::{Delivery, Fault, PipelineError, Settings, Stage, StageLatencies, run};
+pub use drops::{DropCount, drops};
 pub use method::{Described, DescribedPair, Method, StageTimes};
 pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};
 pub use trim::Share;

@@ -1,7 +1,7 @@
 //! What a run came to: counts, latencies stage by stage, processor time and memory.
 
-use super::StageLatencies;
 use super::histogram::Histogram;
+use super::{Fault, Stage, StageLatencies};
 use crate::estimation::{Odometry, Status};
 use serde::Serialize;
 use std::time::{Duration, Instant};
@@ -15,6 +15,7 @@ pub struct Statistics {
     latencies: [Histogram; STAGES.len()],
     inliers: u64,
     path_m: f64,
+    first_epoch: Option<u32>,
     first_ns: Option<i64>,
     last_ns: i64,
 }
@@ -24,8 +25,14 @@ pub struct Statistics {
 pub struct RunCounts {
     /// Rows written: all pairs of the recording.
     pub pairs: u64,
-    /// Pairs whose images could not be used.
+    /// Pairs that could not be used.
     pub unusable: u64,
+    /// Those of them whose images never came, or could not be read.
+    pub unusable_in_capture: u64,
+    /// Those of them in which no features could be looked for.
+    pub unusable_in_features: u64,
+    /// Those of them whose features could not be matched.
+    pub unusable_in_matching: u64,
     /// Pairs that began an odometry frame.
     pub initializing: u64,
     /// Pairs with a measured motion.
@@ -90,13 +97,19 @@ impl Statistics {
             latencies: Default::default(),
             inliers: 0,
             path_m: 0.0,
+            first_epoch: None,
             first_ns: None,
             last_ns: 0,
         }
     }
 
     /// Takes note of a pair.
-    pub fn add(&mut self, odometry: &Odometry, latencies: &StageLatencies, usable: bool) {
+    pub fn add(
+        &mut self,
+        odometry: &Odometry,
+        latencies: &StageLatencies,
+        fault: Option<Fault<'_>>,
+    ) {
         let counts = &mut self.counts;
         counts.pairs += 1;
         match odometry.status {
@@ -105,13 +118,19 @@ impl Statistics {
             Status::Degraded => counts.degraded += 1,
             Status::Lost => counts.lost += 1,
         }
-        counts.restarts = u64::from(odometry.epoch);
+        let first_epoch = *self.first_epoch.get_or_insert(odometry.epoch);
+        counts.restarts = u64::from(odometry.epoch.saturating_sub(first_epoch));
         self.inliers += u64::from(odometry.counts.inliers);
         self.path_m += odometry.prev_from_now.translation.vector.norm();
         self.first_ns.get_or_insert(odometry.timestamp_ns);
         self.last_ns = odometry.timestamp_ns;
-        if !usable {
+        if let Some(fault) = fault {
             counts.unusable += 1;
+            match fault.stage {
+                Stage::Capture => counts.unusable_in_capture += 1,
+                Stage::Features => counts.unusable_in_features += 1,
+                Stage::Matching => counts.unusable_in_matching += 1,
+            }
             return;
         }
         let stages = [

@@ -127,7 +127,7 @@ mod tests {
     }
 
     /// Stages whose work is a fixed part and one that goes with the share; cameras of one period. The queue
-    /// holds two pairs, as the capture's does.
+    /// holds one pair, as the capture's does.
     fn overload(fixed_ms: f64, share_ms: f64, period_ms: f64, rows: usize) -> (FrameBudget, usize) {
         let mut budget = FrameBudget::new(Duration::from_secs(1), true);
         let (mut backlog_ms, mut dropped_late) = (0.0_f64, 0);
@@ -135,7 +135,7 @@ mod tests {
             backlog_ms += fixed_ms + share_ms * f64::from(budget.share()) - period_ms;
             backlog_ms = backlog_ms.max(0.0);
             let mut waiting = (backlog_ms / period_ms) as usize;
-            while waiting > 2 {
+            while waiting > 1 {
                 waiting -= 1;
                 backlog_ms -= period_ms;
                 dropped_late += usize::from(n > rows / 2);

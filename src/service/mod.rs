@@ -10,10 +10,12 @@
 //! | [`vitals`] | decides whether the daemon is alive |
 //! | [`realtime`] | priorities, processors, memory that stays |
 //! | [`budget`] | counts pairs that took too long, and trims features before pairs are dropped |
+//! | [`metrics`] | answers those who fetch figures |
 //! | [`log`] | to the journal or to a terminal |
 
 pub mod budget;
 pub mod log;
+pub mod metrics;
 pub mod notify;
 pub mod realtime;
 pub mod settings;

@@ -232,7 +232,7 @@ impl Running {
     }
 
     /// Waits until it ends of itself.
-    fn end(mut self) -> Output {
+    pub(crate) fn end(mut self) -> Output {
         self.0.take().unwrap().wait_with_output().unwrap()
     }
 }

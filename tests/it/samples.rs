@@ -70,6 +70,8 @@ fn all_keys() -> BTreeSet<String> {
     });
     config.publish.root = Some("/run/visod".into());
     config.publish.prefix = Some("robot1_".to_owned());
+    config.last_pose.file = Some("/var/lib/visod/last_pose.toml".into());
+    config.metrics.listen = Some("127.0.0.1:9477".to_owned());
     keys(&toml::Table::try_from(config).unwrap())
 }
 

@@ -178,7 +178,7 @@ impl Assembly {
     /// nothing but the frame. Before the first pair there is nothing that could be missed.
     fn unmatched(&mut self, side: Side, frame: Candidate<Waiting>, why: WhyUnmatched) {
         self.journal.note(entry(side, &frame, Fate::Unmatched(why)));
-        self.cameras[side as usize].unmatched += 1;
+        self.cameras[side as usize].unmatched.add(&why);
         if side == Side::Left && self.pairs > 0 {
             let timestamp_ns = self.times.of_row(frame.item.stamp_ns, frame.item.host_ns);
             let why = format!("the left frame {} has no partner: {why}", frame.number);

@@ -39,8 +39,7 @@ use std::time::{Duration, Instant};
 pub struct LiveSource {
     shared: Arc<Shared>,
     threads: Vec<JoinHandle<()>>,
-    /// Pairs that may wait.
-    queue: usize,
+    delivery: Delivery,
 }
 
 /// Looks at the cameras while somebody else has the [`LiveSource`], and ends its run.
@@ -93,7 +92,7 @@ impl LiveSource {
         let mut live = Self {
             shared: Arc::clone(&shared),
             threads: Vec::new(),
-            queue: delivery.queue,
+            delivery,
         };
         let sides = [Side::Left, Side::Right].into_iter();
         for ((side, source), opener) in sides.zip(sources).zip(openers) {
@@ -163,9 +162,13 @@ impl PairSource for LiveSource {
         }
     }
 
+    fn is_live(&self) -> bool {
+        self.delivery.overflow == Overflow::Oldest
+    }
+
     /// As many images as can be under way: with the consumer, in the queue, and in the pairer.
     fn make_room(&mut self, pairs_held: usize) {
-        let count = pairs_held + self.queue + MAX_WAITING;
+        let count = pairs_held + self.delivery.queue + MAX_WAITING;
         self.shared.lock().spares.grow(count);
     }
 

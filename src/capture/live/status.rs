@@ -2,6 +2,7 @@
 
 use crate::capture::camera::Losses;
 use crate::capture::clock::ClockEstimate;
+use crate::capture::pairing::Unmatched;
 
 /// What a camera is doing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -49,8 +50,8 @@ pub struct CameraStatus {
     pub last_look_ns: i64,
     /// Frames that were lost, by kind.
     pub losses: Losses,
-    /// Frames without a partner.
-    pub unmatched: u64,
+    /// Frames without a partner, by reason.
+    pub unmatched: Unmatched,
     /// Times that its clock was set or began anew.
     pub clock_steps: u64,
     /// How its clock stands to the host's, where it has one of its own.

@@ -279,7 +279,7 @@ fn a_journal_has_every_frame() {
         let paired = of(side, |f| matches!(f, Fate::Paired(_)));
         let alone = of(side, |f| matches!(f, Fate::Unmatched(_)));
         assert_eq!(paired, snapshot.pairs);
-        assert_eq!(alone, camera.unmatched);
+        assert_eq!(alone, camera.unmatched.total());
         // Those that still waited for their partner have no fate yet.
         assert!(camera.frames - paired - alone <= 8);
         assert_eq!(

@@ -2,6 +2,8 @@
 
 #![allow(dead_code, reason = "each bench takes what it needs")]
 
+#[cfg(feature = "ipc")]
+pub mod daemon;
 pub mod memory;
 
 use std::time::{Duration, Instant};
@@ -49,6 +51,13 @@ impl Times {
 /// A duration, ms.
 pub fn ms(time: Duration) -> f64 {
     time.as_secs_f64() * 1e3
+}
+
+/// The time that `share` of sorted times do not exceed, µs.
+pub fn quantile_us(sorted: &[Duration], share: f64) -> f64 {
+    let at = (share * sorted.len() as f64).ceil() as usize;
+    let time = sorted.get(at.saturating_sub(1));
+    time.map_or(f64::NAN, |time| time.as_secs_f64() * 1e6)
 }
 
 /// Begins a table of times.

@@ -1,0 +1,137 @@
+//! Pairs that come twice as fast as they can be handled: `cargo bench --bench overload [-- SECONDS]`.
+//!
+//! First it is measured how fast pairs can be handled; then they come at half of that, at twice that for a
+//! minute, and at half of it again. Latencies are those of a subscriber in another process: from when the
+//! left image was taken to when the message is here.
+
+mod common;
+
+use common::daemon::{Daemon, record};
+use common::words;
+use visod::output::monotonic_ns;
+
+/// Before and after the overload, s.
+const CALM_S: f64 = 10.0;
+
+type Outcome = Result<(), Box<dyn std::error::Error>>;
+
+/// What a message says, as far as it matters here.
+#[derive(Clone, Copy)]
+struct Arrival {
+    sequence: u64,
+    taken_ns: i64,
+    latency_ms: f64,
+}
+
+fn main() -> Outcome {
+    let seconds = words().first().map_or(Ok(60.0), |s| s.parse())?;
+    for trim in [false, true] {
+        println!(
+            "\n### Overload, 320 × 240 px, trimming {}\n",
+            if trim { "on" } else { "off" }
+        );
+        let more = format!("[service]\ntrim = {trim}\n");
+        // Far more than can be handled: what comes out is how fast that is.
+        let flood: Vec<f64> = (0..4000).map(|n| f64::from(n) / 400.0).collect();
+        let handled = follow(&flood, "[service]\ntrim = false\n")?.0;
+        let (first, last) = (handled[handled.len() / 4], handled[handled.len() - 1]);
+        let span_s = (last.taken_ns - first.taken_ns) as f64 * 1e-9;
+        let rate_hz = (handled.len() - handled.len() / 4 - 1) as f64 / span_s;
+        let frame_ms = 1e3 / rate_hz;
+        println!("{rate_hz:.1} pairs a second can be handled: {frame_ms:.2} ms a pair\n");
+        overload(rate_hz, seconds, &more)?;
+    }
+    Ok(())
+}
+
+fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
+    let phases = [
+        ("half as fast as they can be handled", 0.5, CALM_S),
+        ("twice as fast", 2.0, seconds),
+        ("half as fast again", 0.5, CALM_S),
+    ];
+    let mut times_s = vec![0.0];
+    let mut ends_s = Vec::new();
+    let mut end_s = 0.0;
+    for (_, factor, lasts_s) in phases {
+        end_s += lasts_s;
+        ends_s.push(end_s);
+        while let Some(last_s) = times_s.last().copied().filter(|t| *t < end_s) {
+            times_s.push(last_s + 1.0 / (factor * rate_hz));
+        }
+    }
+    let (arrivals, summary) = follow(&times_s, more)?;
+    let Some(first) = arrivals.first() else {
+        return Err("nothing arrives".into());
+    };
+    let began_ns = first.taken_ns;
+    let at_s = |arrival: &Arrival| (arrival.taken_ns - began_ns) as f64 * 1e-9;
+    println!(
+        "| pairs come | came | handled | one handled every ms | latency: median ms | p99 ms | max ms |"
+    );
+    println!("|---|---:|---:|---:|---:|---:|---:|");
+    let mut began_s = f64::NEG_INFINITY;
+    for ((name, ..), end_s) in phases.iter().zip(&ends_s) {
+        let inside: Vec<&Arrival> = arrivals
+            .iter()
+            .filter(|arrival| (began_s..*end_s).contains(&at_s(arrival)))
+            .collect();
+        let (Some(first), Some(last)) = (inside.first(), inside.last()) else {
+            return Err(format!("{name}: nothing arrives").into());
+        };
+        let mut latencies: Vec<f64> = inside.iter().map(|arrival| arrival.latency_ms).collect();
+        latencies.sort_by(f64::total_cmp);
+        let quantile = |share: f64| latencies[(share * (latencies.len() - 1) as f64) as usize];
+        println!(
+            "| {name} | {} | {} | {:.1} | {:.1} | {:.1} | {:.1} |",
+            last.sequence - first.sequence + 1,
+            inside.len(),
+            1e3 * (at_s(last) - at_s(first)) / (inside.len() - 1).max(1) as f64,
+            quantile(0.5),
+            quantile(0.99),
+            quantile(1.0)
+        );
+        began_s = *end_s;
+    }
+    // The first pair after which none is dropped any more.
+    let over_s = ends_s[1];
+    let last_gap = arrivals
+        .windows(2)
+        .filter(|two| two[1].sequence > two[0].sequence + 1 && at_s(&two[1]) < over_s + CALM_S)
+        .map(|two| at_s(&two[1]))
+        .next_back();
+    println!(
+        "\n{} dropped in the queue by the daemon's own count; the last gap in what arrives ends {:.0} ms after \
+         the overload",
+        summary["dropped"],
+        last_gap.map_or(0.0, |gap_s| 1e3 * (gap_s - over_s))
+    );
+    Ok(())
+}
+
+/// All that arrives of pairs that come at the given times, and the daemon's summary.
+fn follow(
+    times_s: &[f64],
+    more: &str,
+) -> Result<(Vec<Arrival>, serde_json::Value), Box<dyn std::error::Error>> {
+    let folder = tempfile::tempdir()?;
+    let recording = folder.path().join("recording");
+    record(&recording, times_s)?;
+    let daemon = Daemon::start(folder.path(), &recording, more)?;
+    let mut arrivals = Vec::with_capacity(times_s.len());
+    let (summary, lost) = daemon.follow(|message| {
+        // Rows that only bridge have no images, and took no time.
+        if message.latency_total_ns > 0 {
+            arrivals.push(Arrival {
+                sequence: message.sequence,
+                taken_ns: message.monotonic_ns,
+                latency_ms: (monotonic_ns() - message.monotonic_ns) as f64 * 1e-6,
+            });
+        }
+        Ok(())
+    })?;
+    if lost > 0 {
+        println!("{lost} messages were lost on the way here");
+    }
+    Ok((arrivals, summary))
+}
