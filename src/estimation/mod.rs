@@ -18,6 +18,7 @@ mod standing;
 #[cfg(test)]
 mod synthetic;
 pub mod track_noise;
+mod tracked_feature;
 mod triangulation;
 pub mod two_frame;
 pub mod weighted;
@@ -28,6 +29,7 @@ pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
 pub use odometer::{Odometer, PairStamp, Place};
 pub use settings::{Method, Settings};
 pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
+pub use tracked_feature::TrackedFeature;
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
 
 use nalgebra::{Isometry3, Matrix6, Vector6};

@@ -70,6 +70,7 @@ fn all_keys() -> BTreeSet<String> {
     });
     config.publish.root = Some("/run/visod".into());
     config.publish.prefix = Some("robot1_".to_owned());
+    config.publish.foxglove = visod::output::publication::FOXGLOVE_ADDRESS.parse().ok();
     keys(&toml::Table::try_from(config).unwrap())
 }
 
