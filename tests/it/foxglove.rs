@@ -31,7 +31,9 @@ fn server() -> FoxgloveServer {
 }
 
 fn pair() -> StereoPair {
-    let dataset = Dataset::open(Recording::shared().path(), None).unwrap();
+    // Its files go with the last who has it.
+    let recording = Recording::shared();
+    let dataset = Dataset::open(recording.path(), None).unwrap();
     let mut source = ReadAhead::start(&dataset).unwrap();
     match source.next_event() {
         Some(PairEvent::Pair(pair)) => pair,
