@@ -16,10 +16,6 @@ const QUEUE: usize = 8;
 #[derive(Default)]
 pub(super) struct Entry {
     pub(super) estimate: Option<Odometry>,
-    #[cfg_attr(
-        not(feature = "foxglove"),
-        expect(dead_code, reason = "recordings have none")
-    )]
     pub(super) latencies: Latencies,
     pub(super) features: Vec<TrackedFeature>,
     images: [GrayImage; 2],
@@ -52,22 +48,10 @@ pub(super) trait Worker: Send + 'static {
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(super) enum WhenBehind {
     /// It is waited for.
-    #[cfg_attr(
-        not(feature = "mcap"),
-        expect(dead_code, reason = "nothing is recorded")
-    )]
     Wait,
     /// Its images are left out, and counted.
-    #[cfg_attr(
-        not(feature = "mcap"),
-        expect(dead_code, reason = "nothing is recorded")
-    )]
     LeaveOutImages,
     /// It is left out, and counted.
-    #[cfg_attr(
-        not(feature = "foxglove"),
-        expect(dead_code, reason = "recordings are whole")
-    )]
     LeaveOut,
 }
 

@@ -99,7 +99,6 @@ pub(super) enum Purpose {
     )]
     Recording,
     /// To be looked at: images are small, and who comes late is told all within a second.
-    #[cfg_attr(not(feature = "foxglove"), expect(dead_code, reason = "nobody looks"))]
     Looking,
 }
 
