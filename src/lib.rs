@@ -34,7 +34,7 @@ mod properties;
 mod queue;
 pub mod refinement;
 pub mod rig_watch;
-#[cfg(feature = "mcap")]
+#[cfg(any(feature = "mcap", feature = "foxglove"))]
 pub mod ros;
 pub mod service;
 pub mod settings;

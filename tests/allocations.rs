@@ -22,6 +22,8 @@ mod tests {
     use visod::features::{self, Extractor, Features};
     use visod::geometry::Rectification;
     use visod::matching::{self, MatchedPair, StereoMatcher, TemporalMatcher};
+    use visod::output::features::FeaturesMessage;
+    use visod::output::message::CaptureTime;
     use visod::pipeline::{self, DescribedPair, Method};
     use visod::simulation::small_rig;
     use visod::{estimation, image::GrayImage};
@@ -176,6 +178,7 @@ mod tests {
     fn whole_method(recording: &Recording, described: &[[Features; 2]]) -> f64 {
         let mut method = method(recording);
         let mut pair = DescribedPair::default();
+        let mut tracked = Box::<FeaturesMessage>::default();
         let mut counted = 0;
         for place in 0..WARM_UP + COUNTED {
             let [left, right] = &described[recording.index(place)];
@@ -189,7 +192,14 @@ mod tests {
             }
             pair.sequence = place;
             pair.timestamp_ns = 100_000_000 * place as i64;
-            let count = allocations(|| assert!(method.step(&mut pair).is_ok()));
+            let mut row = None;
+            let count = allocations(|| row = method.step(&mut pair).ok());
+            let row = row.expect("matched");
+            let gathered = allocations(|| {
+                tracked.fill(&row, CaptureTime::Recorded(0), method.tracked());
+            });
+            assert_eq!(gathered, 0, "tracked features");
+            assert!(place == 0 || tracked.count > 20, "{}", tracked.count);
             counted += if place < WARM_UP { 0 } else { count };
         }
         // To be tightened to `assert_eq!(counted, 0)` once the estimation has buffers of its own.

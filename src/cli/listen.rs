@@ -6,6 +6,9 @@ use std::path::PathBuf;
 
 /// Print odometry as it is published: pose ± σ, rate and latency.
 ///
+/// On a terminal a picture of the last estimate with its error budget and the state of the cameras; in a
+/// pipe a line an estimate. Colours are off in pipes and where NO_COLOR is set.
+///
 /// Waits for a publisher if there is none yet. Ends with success on SIGINT, SIGTERM, after --count
 /// messages, or when its output is closed.
 #[derive(clap::Args)]
@@ -15,11 +18,14 @@ use std::path::PathBuf;
 )]
 pub(crate) struct Args {
     /// Print one JSON object a line, with all that was published.
-    #[arg(long, conflicts_with = "csv")]
+    #[arg(long, conflicts_with_all = ["csv", "lines"])]
     json: bool,
     /// Print the odometry CSV that `replay --odometry` writes.
-    #[arg(long)]
+    #[arg(long, conflicts_with = "lines")]
     csv: bool,
+    /// Print a line an estimate on a terminal, too, where one picture is drawn over and over otherwise.
+    #[arg(long)]
+    lines: bool,
     /// End after this many messages.
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
     count: Option<u64>,
@@ -59,6 +65,14 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
 }
 
 impl Args {
+    /// Whether a picture is drawn.
+    #[cfg(feature = "ipc")]
+    fn is_view(&self) -> bool {
+        use std::io::IsTerminal;
+        let can_draw = std::env::var_os("TERM").is_some_and(|term| term != "dumb");
+        !self.json && !self.csv && !self.lines && can_draw && std::io::stdout().is_terminal()
+    }
+
     #[cfg_attr(
         not(feature = "ipc"),
         expect(dead_code, reason = "only a listener reads them")
@@ -74,15 +88,17 @@ impl Args {
 
 #[cfg(feature = "ipc")]
 mod running {
+    use super::super::listen_view::{Scene, Screen};
     use super::{Args, Failure};
+    use crate::output::health::HealthMessage;
     use crate::output::message::{OdometryMessage, PoseFrame};
     use crate::output::publication::Settings;
     use crate::output::row::OdometryRow;
-    use crate::output::subscriber::{OdometrySubscriber, Received, Wake};
+    use crate::output::subscriber::{HealthSubscriber, OdometrySubscriber, Received, Wake};
     use crate::output::{csv, json};
     use std::collections::VecDeque;
     use std::fmt::Write as _;
-    use std::io::{ErrorKind, Write as _};
+    use std::io::{self, ErrorKind, Write as _};
     use std::time::{Duration, Instant};
 
     /// A stream that is silent for longer is told of.
@@ -100,11 +116,12 @@ mod running {
     pub(super) fn listen(args: &Args, settings: &Settings) -> Result<(), Failure> {
         let mut subscriber = OdometrySubscriber::handling_signals("visod listen", settings)
             .map_err(Failure::other)?;
-        let mut printer = Printer::new(args);
-        if args.csv && printer.print_line(&csv::header_line())? == Next::End {
+        let mut shown = Shown::new(args, settings)?;
+        if args.csv && print_line(&csv::header_line())? == Next::End {
             return Ok(());
         }
-        let mut silence = Silence::new(args.timeout);
+        let mut silence = Silence::new(args.timeout, matches!(shown, Shown::View(_)));
+        let mut messages = 0;
         loop {
             match subscriber.wait(silence.patience()) {
                 Ok(Wake::Terminated) => return Ok(()),
@@ -113,13 +130,18 @@ mod running {
                     Ok(None) => {}
                     Ok(Some(received)) => {
                         silence.end();
-                        if printer.print(&received)? == Next::End {
+                        messages += 1;
+                        let is_last = args.count == Some(messages);
+                        if shown.take(&received, is_last)? == Next::End || is_last {
                             return Ok(());
                         }
                     }
-                    Err(e) => eprintln!("visod: {e}"),
+                    Err(e) => shown.complain(&e),
                 },
-                Err(e) => eprintln!("visod: {e}"),
+                Err(e) => shown.complain(&e),
+            }
+            if shown.pass_time(&silence)? == Next::End {
+                return Ok(());
             }
         }
     }
@@ -129,20 +151,23 @@ mod running {
         since: Instant,
         told: bool,
         timeout: Option<Duration>,
+        /// Somebody looks at a picture, which tells of it.
+        is_shown: bool,
     }
 
     impl Silence {
-        fn new(timeout: Option<Duration>) -> Self {
+        fn new(timeout: Option<Duration>, is_shown: bool) -> Self {
             Self {
                 since: Instant::now(),
-                told: false,
+                told: is_shown,
                 timeout,
+                is_shown,
             }
         }
 
         fn end(&mut self) {
             self.since = Instant::now();
-            self.told = false;
+            self.told = self.is_shown;
         }
 
         /// How long to wait before the next thing there is to say.
@@ -183,20 +208,143 @@ mod running {
         }
     }
 
-    struct Printer<'a> {
-        args: &'a Args,
-        line: String,
-        printed: u64,
-        arrivals: VecDeque<Instant>,
+    /// Where messages go: a line each, or one picture of the last.
+    enum Shown<'a> {
+        Lines(Lines<'a>),
+        View(Box<View>),
     }
 
-    impl<'a> Printer<'a> {
+    impl<'a> Shown<'a> {
+        fn new(args: &'a Args, settings: &Settings) -> Result<Self, Failure> {
+            if !args.is_view() {
+                return Ok(Self::Lines(Lines::new(args)));
+            }
+            let health = HealthSubscriber::new("visod listen", settings).map_err(Failure::other)?;
+            Ok(Self::View(Box::new(View::new(health))))
+        }
+
+        fn take(
+            &mut self,
+            received: &Received<OdometryMessage>,
+            is_last: bool,
+        ) -> Result<Next, Failure> {
+            match self {
+                Self::Lines(lines) => lines.print(received),
+                Self::View(view) => {
+                    view.take(received);
+                    if is_last {
+                        view.draw(Duration::ZERO)
+                    } else {
+                        Ok(Next::Continue)
+                    }
+                }
+            }
+        }
+
+        /// Draws what has changed, if it is time to.
+        fn pass_time(&mut self, silence: &Silence) -> Result<Next, Failure> {
+            match self {
+                Self::View(view) if view.screen.is_due() => view.draw(silence.since.elapsed()),
+                _ => Ok(Next::Continue),
+            }
+        }
+
+        fn complain(&mut self, cause: &impl std::fmt::Display) {
+            eprintln!("visod: {cause}");
+            if let Self::View(view) = self {
+                view.screen.move_on();
+            }
+        }
+    }
+
+    /// The rate at which messages come.
+    struct Arrivals(VecDeque<Instant>);
+
+    impl Arrivals {
+        fn new() -> Self {
+            Self(VecDeque::with_capacity(RATE_WINDOW + 1))
+        }
+
+        fn note(&mut self, new_publisher: bool) {
+            if new_publisher {
+                self.0.clear();
+            }
+            self.0.push_back(Instant::now());
+            if self.0.len() > RATE_WINDOW + 1 {
+                self.0.pop_front();
+            }
+        }
+
+        fn rate_hz(&self) -> Option<f64> {
+            let (first, last) = (self.0.front()?, self.0.back()?);
+            let span_s = (*last - *first).as_secs_f64();
+            (span_s > 0.0).then(|| (self.0.len() - 1) as f64 / span_s)
+        }
+    }
+
+    /// A picture of the last message.
+    struct View {
+        screen: Screen,
+        arrivals: Arrivals,
+        lost: u64,
+        last: Option<(OdometryMessage, i64)>,
+        health: HealthSubscriber,
+        last_health: Option<HealthMessage>,
+    }
+
+    impl View {
+        fn new(health: HealthSubscriber) -> Self {
+            Self {
+                screen: Screen::new(),
+                arrivals: Arrivals::new(),
+                lost: 0,
+                last: None,
+                health,
+                last_health: None,
+            }
+        }
+
+        fn take(&mut self, received: &Received<OdometryMessage>) {
+            let message = received.message;
+            let transport_ns = crate::output::monotonic_ns() - message.published_monotonic_ns;
+            self.arrivals.note(received.new_publisher);
+            self.lost += received.lost_before;
+            self.last = Some((message, transport_ns));
+        }
+
+        fn draw(&mut self, silence: Duration) -> Result<Next, Failure> {
+            // Health that cannot be used is not shown; the next one comes within a second.
+            while let Ok(Some(health)) = self.health.receive() {
+                self.last_health = Some(health.message);
+            }
+            let Some((message, transport_ns)) = &self.last else {
+                return Ok(Next::Continue);
+            };
+            let scene = Scene {
+                message,
+                rate_hz: self.arrivals.rate_hz(),
+                lost: self.lost,
+                silence,
+                transport_ns: *transport_ns,
+                health: self.last_health.as_ref(),
+            };
+            written(self.screen.draw(&scene))
+        }
+    }
+
+    /// A line a message.
+    struct Lines<'a> {
+        args: &'a Args,
+        line: String,
+        arrivals: Arrivals,
+    }
+
+    impl<'a> Lines<'a> {
         fn new(args: &'a Args) -> Self {
             Self {
                 args,
                 line: String::with_capacity(4096),
-                printed: 0,
-                arrivals: VecDeque::with_capacity(RATE_WINDOW + 1),
+                arrivals: Arrivals::new(),
             }
         }
 
@@ -207,16 +355,12 @@ mod running {
                     received.lost_before, received.message.sequence
                 );
             }
-            self.note_arrival(received.new_publisher);
+            self.arrivals.note(received.new_publisher);
             let mut line = std::mem::take(&mut self.line);
             line.clear();
             self.format(&mut line, &received.message);
-            let next = self.print_line(&line)?;
+            let next = print_line(&line)?;
             self.line = line;
-            self.printed += 1;
-            if self.args.count == Some(self.printed) {
-                return Ok(Next::End);
-            }
             Ok(next)
         }
 
@@ -228,39 +372,28 @@ mod running {
                 if self.args.csv {
                     csv::push_row(line, &row);
                 } else {
-                    describe(line, message, &row, self.rate_hz(), now_ns);
+                    describe(line, message, &row, self.arrivals.rate_hz(), now_ns);
                 }
             }
         }
+    }
 
-        /// Writes a line at once. A reader that has gone is no failure.
-        fn print_line(&self, line: &str) -> Result<Next, Failure> {
-            let mut out = std::io::stdout().lock();
-            let written = out
-                .write_all(line.as_bytes())
+    /// Writes a line at once.
+    fn print_line(line: &str) -> Result<Next, Failure> {
+        let mut out = io::stdout().lock();
+        written(
+            out.write_all(line.as_bytes())
                 .and_then(|()| out.write_all(b"\n"))
-                .and_then(|()| out.flush());
-            match written {
-                Ok(()) => Ok(Next::Continue),
-                Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(Next::End),
-                Err(e) => Err(Failure::other(format!("cannot write the output: {e}"))),
-            }
-        }
+                .and_then(|()| out.flush()),
+        )
+    }
 
-        fn note_arrival(&mut self, new_publisher: bool) {
-            if new_publisher {
-                self.arrivals.clear();
-            }
-            self.arrivals.push_back(Instant::now());
-            if self.arrivals.len() > RATE_WINDOW + 1 {
-                self.arrivals.pop_front();
-            }
-        }
-
-        fn rate_hz(&self) -> Option<f64> {
-            let (first, last) = (self.arrivals.front()?, self.arrivals.back()?);
-            let span_s = (*last - *first).as_secs_f64();
-            (span_s > 0.0).then(|| (self.arrivals.len() - 1) as f64 / span_s)
+    /// A reader that has gone is no failure.
+    fn written(result: io::Result<()>) -> Result<Next, Failure> {
+        match result {
+            Ok(()) => Ok(Next::Continue),
+            Err(e) if e.kind() == ErrorKind::BrokenPipe => Ok(Next::End),
+            Err(e) => Err(Failure::other(format!("cannot write the output: {e}"))),
         }
     }
 

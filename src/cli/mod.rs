@@ -13,6 +13,8 @@ mod features;
 #[cfg(feature = "ipc")]
 mod health;
 mod listen;
+#[cfg(feature = "ipc")]
+mod listen_view;
 mod live;
 mod metrics;
 mod montecarlo;

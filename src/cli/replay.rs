@@ -7,6 +7,8 @@ use crate::capture::mcap::McapRecording;
 use crate::capture::{Dataset, PairSource, ReadAhead, Realtime};
 use crate::config::Config;
 use crate::geometry::{StereoRig, load_rig};
+use crate::output::publication::FOXGLOVE_ADDRESS;
+use std::net::SocketAddr;
 use std::path::{Path, PathBuf};
 
 /// Run a recording through the pipeline instead of cameras.
@@ -42,6 +44,9 @@ pub(crate) struct Args {
     /// tell.
     #[arg(long, num_args = 2, value_names = ["LEFT", "RIGHT"])]
     topics: Option<Vec<String>>,
+    /// Show the run to Foxglove over a WebSocket: at 127.0.0.1:8765, or at another address.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = FOXGLOVE_ADDRESS)]
+    foxglove: Option<SocketAddr>,
     /// Write the run's figures as JSON: counts, latencies, processor time, memory.
     #[arg(long, value_name = "F.json")]
     summary: Option<PathBuf>,
@@ -128,6 +133,7 @@ fn replay(
     session.write_csv(args.odometry.as_deref())?;
     session.write_trajectory(args.trajectory.as_deref())?;
     session.write_mcap(args.mcap.as_deref())?;
+    session.show(args.foxglove)?;
     if args.report.is_some() {
         session.keep_rows();
     }

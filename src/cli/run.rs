@@ -7,7 +7,9 @@ use super::{Failure, summary};
 use crate::capture::camera::realtime_ns;
 use crate::capture::live::{Delivery, Overflow};
 use crate::output::last_pose::{Keeper, Legacy};
+use crate::output::publication::FOXGLOVE_ADDRESS;
 use crate::service::log;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// Follow two cameras and publish pose and covariance until stopped.
@@ -31,6 +33,9 @@ pub(crate) struct Args {
     /// Record images, poses and state as messages of ROS 2, for Foxglove and ROS 2's own tools.
     #[arg(long, value_name = "F.mcap")]
     mcap: Option<PathBuf>,
+    /// Show the run to Foxglove over a WebSocket: at 127.0.0.1:8765, or at another address.
+    #[arg(long, value_name = "ADDR", num_args = 0..=1, default_missing_value = FOXGLOVE_ADDRESS)]
+    foxglove: Option<SocketAddr>,
     /// Write the run's figures as JSON.
     #[arg(long, value_name = "F.json")]
     summary: Option<PathBuf>,
@@ -82,6 +87,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     session.watch(source.monitor(), attendant.pulse());
     session.serve_metrics()?;
     session.write_mcap(args.mcap.as_deref())?;
+    session.show(args.foxglove)?;
     if let Some(rows) = args.hang_after {
         session.on_each_row(hang_after(rows));
     }

@@ -12,6 +12,10 @@ use crate::config::Config;
 use crate::features;
 use crate::geometry::{Severity, StereoRig, check_rig};
 use crate::output::csv::OdometryCsvWriter;
+#[cfg(feature = "ipc")]
+use crate::output::features::FeaturesMessage;
+#[cfg(feature = "foxglove")]
+use crate::output::foxglove::FoxgloveServer;
 use crate::output::last_pose::{Keeper, Legacy};
 #[cfg(feature = "mcap")]
 use crate::output::mcap::McapRecorder;
@@ -28,6 +32,7 @@ use crate::service::metrics::Exposition;
 use indicatif::ProgressBar;
 use std::fs::File;
 use std::io;
+use std::net::SocketAddr;
 use std::ops::ControlFlow;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -43,9 +48,13 @@ pub(crate) struct Session {
     trajectory: Option<(PathBuf, TumWriter<File>)>,
     #[cfg(feature = "mcap")]
     mcap: Option<(PathBuf, McapRecorder)>,
+    #[cfg(feature = "foxglove")]
+    foxglove: Option<FoxgloveServer>,
     rows: Option<Vec<OdometryRow>>,
     #[cfg(feature = "ipc")]
     publisher: Option<Publisher>,
+    #[cfg(feature = "ipc")]
+    features: Box<FeaturesMessage>,
     #[cfg(feature = "ipc")]
     health: Health,
     published: u64,
@@ -109,9 +118,13 @@ impl Session {
             trajectory: None,
             #[cfg(feature = "mcap")]
             mcap: None,
+            #[cfg(feature = "foxglove")]
+            foxglove: None,
             rows: None,
             #[cfg(feature = "ipc")]
             publisher: None,
+            #[cfg(feature = "ipc")]
+            features: Box::default(),
             #[cfg(feature = "ipc")]
             health: Health::default(),
             published: 0,
@@ -193,6 +206,30 @@ impl Session {
         }
     }
 
+    /// Shows the run to Foxglove: at the address given, else at that of the configuration, if any.
+    pub(crate) fn show(&mut self, address: Option<SocketAddr>) -> Result<(), Failure> {
+        match address.or(self.config.publish.foxglove) {
+            Some(address) => self.show_at(address),
+            None => Ok(()),
+        }
+    }
+
+    #[cfg(feature = "foxglove")]
+    fn show_at(&mut self, address: SocketAddr) -> Result<(), Failure> {
+        let server = FoxgloveServer::start(address, &self.rig)
+            .map_err(|e| Failure::other(format!("foxglove: cannot listen at {address}: {e}")))?;
+        eprintln!("visod: Foxglove finds this run at {}", server.url());
+        self.foxglove = Some(server);
+        Ok(())
+    }
+
+    #[cfg(not(feature = "foxglove"))]
+    fn show_at(&mut self, address: SocketAddr) -> Result<(), Failure> {
+        Err(Failure::usage(format!(
+            "foxglove: nothing can be shown at {address}: this visod was built without the feature foxglove"
+        )))
+    }
+
     /// Keeps all rows for a report.
     pub(crate) fn keep_rows(&mut self) {
         self.rows = Some(Vec::new());
@@ -251,7 +288,7 @@ impl Session {
             self.warn_of_first_order(&delivery, &bar);
             self.warn_of_rig(&delivery, &bar);
             last = Some(self.deliver(&delivery, &bar)?);
-            self.show(&delivery, statistics.counts());
+            self.leave_figures(&delivery, statistics.counts());
             bar.inc(1);
             Ok::<_, io::Error>(ControlFlow::Continue(()))
         })
@@ -271,6 +308,15 @@ impl Session {
                 eprintln!(
                     "visod: warning: {}: the images of {left_out} pairs were left out, as the disk was behind",
                     file.display()
+                );
+            }
+        }
+        #[cfg(feature = "foxglove")]
+        if let Some(server) = self.foxglove {
+            let left_out = server.left_out();
+            if left_out > 0 {
+                eprintln!(
+                    "visod: warning: foxglove: {left_out} pairs were not shown, as there was no time to"
                 );
             }
         }
@@ -367,20 +413,26 @@ impl Session {
         }
         #[cfg(feature = "mcap")]
         if let Some((file, mcap)) = &mut self.mcap {
-            mcap.add(delivery.odometry, delivery.pair)
+            mcap.add(delivery.odometry, delivery.method.tracked(), delivery.pair)
                 .map_err(|e| named(file, &e))?;
         }
+        #[cfg(feature = "foxglove")]
+        self.present(delivery);
         if let Some(see) = &mut self.each_row {
             bar.suspend(|| see(&row));
         }
         if let Some(rows) = &mut self.rows {
-            rows.push(row.clone());
+            // A report is about this run, so that it shows how long things took.
+            rows.push(OdometryRow {
+                latency_ms: delivery.unusable.is_none().then_some(total_ms),
+                ..row.clone()
+            });
         }
         Ok(row)
     }
 
     /// Leaves the totals up to a row to those who fetch figures.
-    fn show(&self, delivery: &Delivery<'_>, counts: &RunCounts) {
+    fn leave_figures(&self, delivery: &Delivery<'_>, counts: &RunCounts) {
         let (Some((metrics, _)), Some(live)) = (&self.metrics, &self.live) else {
             return;
         };
@@ -400,6 +452,29 @@ impl Session {
         metrics.add(delivery, totals);
     }
 
+    /// Shows one row to Foxglove; where that fails nobody looks any more.
+    #[cfg(feature = "foxglove")]
+    fn present(&mut self, delivery: &Delivery<'_>) {
+        let capture_ns = self.live.as_ref().map_or(0, |live| {
+            let captured = live.cameras.captured(delivery.odometry.sequence);
+            captured.map_or(0, |at| {
+                u64::try_from(at.complete_ns - at.monotonic_ns).unwrap_or(0)
+            })
+        });
+        if let Some(server) = &mut self.foxglove {
+            let shown = server.add(
+                delivery.odometry,
+                latencies(&delivery.latencies, capture_ns),
+                delivery.method.tracked(),
+                delivery.pair,
+            );
+            if let Err(cause) = shown {
+                eprintln!("visod: warning: foxglove: {cause}");
+                self.foxglove = None;
+            }
+        }
+    }
+
     #[cfg(feature = "ipc")]
     fn send(&mut self, delivery: &Delivery<'_>) {
         use crate::output::message::OdometryMessage;
@@ -415,13 +490,17 @@ impl Session {
             captured.0,
             latencies(&delivery.latencies, captured.1),
         );
-        match publisher.publish(&message) {
-            Ok(_) => self.published += 1,
-            Err(e) => {
-                self.publish_failures += 1;
-                if self.publish_failures == 1 {
-                    eprintln!("visod: warning: {e}");
-                }
+        let mut sent = publisher.publish(&message);
+        self.published += u64::from(sent.is_ok());
+        if publisher.publishes_features() {
+            let tracked = delivery.method.tracked();
+            self.features.fill(delivery.odometry, captured.0, tracked);
+            sent = sent.and(publisher.publish_features(&self.features));
+        }
+        if let Err(e) = sent {
+            self.publish_failures += 1;
+            if self.publish_failures == 1 {
+                eprintln!("visod: warning: {e}");
             }
         }
         self.health.add(delivery);
@@ -493,7 +572,7 @@ impl Live {
 }
 
 /// The stages' latencies as the message has them.
-#[cfg(feature = "ipc")]
+#[cfg(any(feature = "ipc", feature = "foxglove"))]
 fn latencies(
     took: &pipeline::StageLatencies,
     capture_ns: u64,

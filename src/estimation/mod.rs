@@ -19,6 +19,7 @@ mod start;
 #[cfg(test)]
 mod synthetic;
 pub mod track_noise;
+mod tracked_feature;
 mod triangulation;
 pub mod two_frame;
 pub mod weighted;
@@ -30,6 +31,7 @@ pub use odometer::{Odometer, PairStamp, Place};
 pub use settings::{Method, Settings};
 pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
 pub use start::Start;
+pub use tracked_feature::TrackedFeature;
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};
 
 use nalgebra::{Isometry3, Matrix6, Vector6};

@@ -92,6 +92,11 @@ impl MotionMeter {
         &self.cov_chained
     }
 
+    /// The tracks that the last motion was measured from: their numbers, and what they showed.
+    pub fn agreed(&self) -> impl Iterator<Item = (u64, &TrackedPoint)> {
+        self.inlier_ids.iter().copied().zip(&self.inliers)
+    }
+
     /// Measures the next motion and adds it to the chain. `guess` is where to look first,
     /// `variance_factor` what to expect of residuals.
     ///

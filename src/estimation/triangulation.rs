@@ -47,6 +47,30 @@ pub struct Landmark {
 }
 
 impl Landmark {
+    /// The point (x, y, 1) / ρ, of (x, y, ρ) and its covariance. `None` where it lies behind the camera,
+    /// or farther away than numbers tell.
+    #[must_use]
+    pub fn from_inverse_depth(inverse_depth: &Vector3<f64>, cov: &Matrix3<f64>) -> Option<Self> {
+        let [x, y, rho] = (*inverse_depth).into();
+        if rho <= 0.0 {
+            return None;
+        }
+        let z = 1.0 / rho;
+        #[rustfmt::skip]
+        let by_inverse_depth = Matrix3::new(
+            z, 0.0, -x * z * z,
+            0.0, z, -y * z * z,
+            0.0, 0.0, -z * z,
+        );
+        let cov_m2 = by_inverse_depth * cov * by_inverse_depth.transpose();
+        let landmark = Self {
+            point: Point3::new(x * z, y * z, z),
+            cov_m2: (cov_m2 + cov_m2.transpose()) * 0.5,
+        };
+        let numbers = landmark.cov_m2.iter().chain(landmark.point.iter());
+        numbers.copied().all(f64::is_finite).then_some(landmark)
+    }
+
     /// Whether first-order propagation holds: σ of the depth is at most 8 % of it, where Monte
     /// Carlo agrees to a per cent. Beyond, depth is not Gaussian (its inverse is).
     #[must_use]
@@ -216,6 +240,32 @@ mod tests {
         StereoMeasurement {
             px: rig.project(point).expect("in view"),
             sigma_px: Vector4::new(0.5, 0.5, 0.5, 0.5),
+        }
+    }
+
+    /// The covariance in inverse depth, carried over, is that of triangulation.
+    #[test]
+    fn inverse_depth_and_triangulation_agree() {
+        let rig = rig(LENS);
+        for z in [1.0, 5.0, 40.0] {
+            let m = measure(&rig, &Point3::new(0.1 * z, -0.08 * z, z));
+            let expected = triangulate(&rig, &m).expect("in front");
+            let y = crate::estimation::inverse_depth(&rig, &m).expect("in front");
+            let by_point =
+                crate::estimation::linearise_sight(&rig, &nalgebra::Isometry3::identity(), &y)
+                    .expect("in view")
+                    .by_point;
+            let info = m.sigma_px.map(|s| 1.0 / (s * s));
+            let cov = (by_point.transpose() * Matrix4::from_diagonal(&info) * by_point)
+                .try_inverse()
+                .expect("determined");
+            let found = Landmark::from_inverse_depth(&y, &cov).expect("in front");
+            assert!((found.point - expected.point).norm() < 1e-7 * z);
+            let gap = (found.cov_m2 - expected.cov_m2).norm();
+            assert!(gap < 1e-5 * expected.cov_m2.norm(), "{gap}");
+            assert_eq!(Landmark::from_inverse_depth(&-y, &cov), None);
+            let far = Vector3::new(y.x, y.y, 1e-200);
+            assert_eq!(Landmark::from_inverse_depth(&far, &cov), None);
         }
     }
 

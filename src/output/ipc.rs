@@ -1,10 +1,11 @@
-//! What publisher and subscriber share: an iceoryx2 node, and the two services of one name.
+//! What publisher and subscriber share: an iceoryx2 node, and the two services of each name.
 
+use super::features::FeaturesMessage;
 use super::health::HealthMessage;
 use super::message::{MessageError, OdometryMessage};
 use super::publication::{
-    HEALTH_BUFFER, HEALTH_SERVICE, MAX_NODES, MAX_PUBLISHERS, MAX_SUBSCRIBERS, ODOMETRY_BUFFER,
-    ODOMETRY_SERVICE, Settings, events,
+    FEATURES_BUFFER, FEATURES_SERVICE, HEALTH_BUFFER, HEALTH_SERVICE, MAX_NODES, MAX_PUBLISHERS,
+    MAX_SUBSCRIBERS, ODOMETRY_BUFFER, ODOMETRY_SERVICE, Settings, events,
 };
 use crate::settings::SettingError;
 use iceoryx2::prelude::{
@@ -104,6 +105,24 @@ pub trait Payload: ZeroCopySend + std::fmt::Debug + Copy + Send + 'static {
 impl Payload for OdometryMessage {
     const SERVICE: &'static str = ODOMETRY_SERVICE;
     const BUFFER: usize = ODOMETRY_BUFFER;
+
+    fn message_number(&self) -> u64 {
+        self.message_number
+    }
+
+    fn stamp(&mut self, message_number: u64, monotonic_ns: i64) {
+        self.message_number = message_number;
+        self.published_monotonic_ns = monotonic_ns;
+    }
+
+    fn check(&self) -> Result<(), MessageError> {
+        self.validate()
+    }
+}
+
+impl Payload for FeaturesMessage {
+    const SERVICE: &'static str = FEATURES_SERVICE;
+    const BUFFER: usize = FEATURES_BUFFER;
 
     fn message_number(&self) -> u64 {
         self.message_number

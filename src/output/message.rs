@@ -110,6 +110,19 @@ pub enum CaptureTime {
     Recorded(i64),
 }
 
+impl CaptureTime {
+    /// As messages have it: flags, CLOCK_REALTIME and CLOCK_MONOTONIC, ns.
+    pub(super) fn flags_and_stamps(self) -> (u32, i64, i64) {
+        match self {
+            Self::Live {
+                realtime_ns,
+                monotonic_ns,
+            } => (flags::MONOTONIC, realtime_ns, monotonic_ns),
+            Self::Recorded(stamp_ns) => (flags::REPLAY, stamp_ns, 0),
+        }
+    }
+}
+
 /// How long each stage took for one pair, ns; 0 where that was not measured.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Latencies {
@@ -227,13 +240,7 @@ impl OdometryMessage {
     ) -> Self {
         let in_base = base_from_camera.map(|mounting| in_base_frame(camera, mounting));
         let odometry = in_base.as_ref().unwrap_or(camera);
-        let (flags, realtime_ns, monotonic_ns) = match captured {
-            CaptureTime::Live {
-                realtime_ns,
-                monotonic_ns,
-            } => (flags::MONOTONIC, realtime_ns, monotonic_ns),
-            CaptureTime::Recorded(stamp_ns) => (flags::REPLAY, stamp_ns, 0),
-        };
+        let (flags, realtime_ns, monotonic_ns) = captured.flags_and_stamps();
         let beyond_first_order = if odometry.is_first_order() {
             0
         } else {
@@ -415,7 +422,7 @@ pub(super) fn check_code(field: &'static str, code: u32, max: u32) -> Result<(),
     })
 }
 
-fn check_unit(field: &'static str, xyzw: &[f64; 4]) -> Result<(), MessageError> {
+pub(super) fn check_unit(field: &'static str, xyzw: &[f64; 4]) -> Result<(), MessageError> {
     let norm = xyzw.iter().map(|v| v * v).sum::<f64>().sqrt();
     if (norm - 1.0).abs() <= 1e-6 {
         return Ok(());
@@ -452,6 +459,8 @@ pub(super) mod tests {
         source
             .lines()
             .filter_map(|line| line.strip_prefix("//! | "))
+            // A `+` would be parsed too: it marks the fields of what is in a message.
+            .filter(|row| !row.starts_with('+'))
             .filter_map(|row| {
                 let mut cells = row.split(" | ");
                 let offset = cells.next()?.trim().parse().ok()?;
@@ -465,8 +474,9 @@ pub(super) mod tests {
     /// Size of a type named in a layout table, bytes.
     pub(crate) fn size_of_named(kind: &str) -> usize {
         match kind {
-            "u32" | "i32" => 4,
+            "u32" | "i32" | "f32" => 4,
             "u64" | "i64" | "f64" => 8,
+            "Feature" => size_of::<crate::output::features::Feature>(),
             other => {
                 let inner = other.trim_matches(['[', ']']);
                 let (element, count) = inner.split_once("; ").unwrap();

@@ -6,15 +6,24 @@
 //! `/etc/iceoryx2/iceoryx2.toml`, whichever is found first.
 
 use crate::settings::SettingError;
+use std::net::SocketAddr;
 use std::path::PathBuf;
 
 /// Service of [`OdometryMessage`](super::message::OdometryMessage) and of the events beside it.
 pub const ODOMETRY_SERVICE: &str = "visod/odometry";
+/// Service of [`FeaturesMessage`](super::features::FeaturesMessage) and of the events beside it; there only
+/// where `publish.features` is set.
+pub const FEATURES_SERVICE: &str = "visod/features";
 /// Service of [`HealthMessage`](super::health::HealthMessage) and of the events beside it.
 pub const HEALTH_SERVICE: &str = "visod/health";
 
+/// Where Foxglove looks for a server of its own accord.
+pub const FOXGLOVE_ADDRESS: &str = "127.0.0.1:8765";
+
 /// Messages that wait for a subscriber before the oldest is overwritten.
 pub const ODOMETRY_BUFFER: usize = 512;
+/// As [`ODOMETRY_BUFFER`], for features: each message is large.
+pub const FEATURES_BUFFER: usize = 8;
 /// As [`ODOMETRY_BUFFER`], for health.
 pub const HEALTH_BUFFER: usize = 16;
 /// Subscribers that a service has room for.
@@ -55,6 +64,12 @@ pub struct Settings {
     /// Publish the pose of the robot's base where the rig has a mounting, else that of the left
     /// camera. Yes or no, default yes: it is what navigation works with.
     pub base_frame: bool,
+    /// Publish the features that each estimate rests on, in the image and in space, as the service
+    /// `visod/features`. Yes or no, default no: 53 kB a pair, which only somebody who looks at them wants.
+    pub features: bool,
+    /// Show every run to Foxglove at this address, over a WebSocket, where visod has the feature foxglove.
+    /// ADDRESS:PORT, default none; 127.0.0.1:8765 is where Foxglove looks, and nobody from elsewhere.
+    pub foxglove: Option<SocketAddr>,
     /// Longest time that a publisher waits on leaving for subscribers that have not yet connected to
     /// it. ms, 0 to 10000, default 500: long enough on a busy machine, short enough to restart.
     pub linger_ms: u64,
@@ -67,6 +82,8 @@ impl Default for Settings {
             prefix: None,
             exclusive: true,
             base_frame: true,
+            features: false,
+            foxglove: None,
             linger_ms: 500,
         }
     }

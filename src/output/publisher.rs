@@ -1,4 +1,5 @@
-//! Odometry and health in, the iceoryx2 services `visod/odometry` and `visod/health` out.
+//! Odometry, features and health in, the iceoryx2 services `visod/odometry`, `visod/features` and
+//! `visod/health` out.
 //!
 //! Each message is written straight into shared memory (all that is allocated is one small block of
 //! iceoryx2's own), and an event of the service of the same name wakes those who wait. A subscriber that is slow loses its oldest
@@ -12,6 +13,7 @@
 //! `dev_permissions`, which lets every local user read *and write*, and is not used here: whoever
 //! can write could forge poses.
 
+use super::features::FeaturesMessage;
 use super::health::HealthMessage;
 use super::ipc::{Ipc, IpcError, Payload, Services, monotonic_ns, open_node};
 use super::message::OdometryMessage;
@@ -28,6 +30,7 @@ const POLL: Duration = Duration::from_millis(5);
 /// Publishes odometry and health. Dropping it leaves in good order: see [`close`](Self::close).
 pub struct Publisher {
     odometry: Channel<OdometryMessage>,
+    features: Option<Channel<FeaturesMessage>>,
     health: Channel<HealthMessage>,
     linger: Duration,
     // Last, so that it goes after everything that lives on it.
@@ -35,7 +38,7 @@ pub struct Publisher {
 }
 
 impl Publisher {
-    /// Opens both services for publishing, and removes what killed processes left in them.
+    /// Opens the services for publishing, that of features where the settings want it, and removes what killed processes left in them.
     ///
     /// # Errors
     /// [`IpcError`]: unusable settings, no access to shared memory, or another publisher while
@@ -44,8 +47,13 @@ impl Publisher {
         let node = open_node("visod", settings, SignalHandlingMode::Disabled)?;
         let odometry = Channel::open(&node, settings.exclusive)?;
         let health = Channel::open(&node, settings.exclusive)?;
+        let features = settings
+            .features
+            .then(|| Channel::open(&node, settings.exclusive))
+            .transpose()?;
         Ok(Self {
             odometry,
+            features,
             health,
             linger: Duration::from_millis(settings.linger_ms),
             _node: node,
@@ -58,6 +66,22 @@ impl Publisher {
     /// [`IpcError`]: the message is not valid, or shared memory is gone.
     pub fn publish(&mut self, message: &OdometryMessage) -> Result<usize, IpcError> {
         self.odometry.send(message)
+    }
+
+    /// Whether features are wanted at all.
+    #[must_use]
+    pub fn publishes_features(&self) -> bool {
+        self.features.is_some()
+    }
+
+    /// Publishes the features that an estimate rests on; nobody gets them unless the settings want it.
+    ///
+    /// # Errors
+    /// As [`publish`](Self::publish).
+    pub fn publish_features(&mut self, message: &FeaturesMessage) -> Result<usize, IpcError> {
+        self.features
+            .as_mut()
+            .map_or(Ok(0), |features| features.send(message))
     }
 
     /// Publishes the state of the daemon; stamps are filled in here.
@@ -75,6 +99,9 @@ impl Publisher {
     /// [`IpcError`]: shared memory is gone.
     pub fn serve_late_joiners(&self) -> Result<(), IpcError> {
         self.odometry.serve_late_joiners()?;
+        if let Some(features) = &self.features {
+            features.serve_late_joiners()?;
+        }
         self.health.serve_late_joiners()
     }
 
@@ -82,6 +109,12 @@ impl Publisher {
     #[must_use]
     pub fn subscribers(&self) -> usize {
         self.odometry.subscribers()
+    }
+
+    /// How many subscribers features have.
+    #[must_use]
+    pub fn features_subscribers(&self) -> usize {
+        self.features.as_ref().map_or(0, Channel::subscribers)
     }
 
     /// Waits until odometry has that many subscribers; false if the time ran out first.
@@ -106,6 +139,9 @@ impl Drop for Publisher {
     fn drop(&mut self) {
         let deadline = Instant::now() + self.linger;
         self.odometry.linger(deadline);
+        if let Some(features) = &self.features {
+            features.linger(deadline);
+        }
         self.health.linger(deadline);
     }
 }
@@ -145,15 +181,13 @@ impl<T: Payload> Channel<T> {
 
     fn send(&mut self, message: &T) -> Result<usize, IpcError> {
         message.check()?;
-        let mut stamped = *message;
-        stamped.stamp(self.next_number, monotonic_ns());
-        let receivers = self
+        let sample = self
             .messages
             .loan_uninit()
-            .map_err(Services::<T>::transfer_error)?
-            .write_payload(stamped)
-            .send()
             .map_err(Services::<T>::transfer_error)?;
+        let mut sample = sample.write_payload(*message);
+        sample.payload_mut().stamp(self.next_number, monotonic_ns());
+        let receivers = sample.send().map_err(Services::<T>::transfer_error)?;
         self.next_number += 1;
         self.notifier
             .notify()

@@ -1,5 +1,6 @@
-//! The iceoryx2 services `visod/odometry` and `visod/health` in, checked messages out.
+//! The iceoryx2 services `visod/odometry`, `visod/features` and `visod/health` in, checked messages out.
 
+use super::features::FeaturesMessage;
 use super::health::HealthMessage;
 use super::ipc::{Ipc, IpcError, Payload, Services, open_node};
 use super::message::OdometryMessage;
@@ -16,6 +17,8 @@ use std::time::{Duration, Instant};
 
 /// Receives odometry.
 pub type OdometrySubscriber = Subscriber<OdometryMessage>;
+/// Receives the features that estimates rest on, where they are published.
+pub type FeaturesSubscriber = Subscriber<FeaturesMessage>;
 /// Receives the state of the daemon.
 pub type HealthSubscriber = Subscriber<HealthMessage>;
 

@@ -65,7 +65,6 @@ pub struct StageLatencies {
 }
 
 /// One pair's row, ready to be published.
-#[derive(Debug)]
 pub struct Delivery<'a> {
     /// The estimate.
     pub odometry: &'a Odometry,
@@ -77,6 +76,8 @@ pub struct Delivery<'a> {
     pub pair: Option<&'a StereoPair>,
     /// How the rig is, where it is watched.
     pub rig: Option<RigState>,
+    /// The method as the pair has left it, for its [tracked features](Method::tracked).
+    pub method: &'a Method,
 }
 
 /// Why a pair could not be used, and who found out.
@@ -360,6 +361,7 @@ fn collect<E>(
                     .map(|(stage, why)| Fault { stage: *stage, why }),
                 pair: outcome.buffers.used.as_ref(),
                 rig: method.rig_state(),
+                method,
             };
             if deliver(delivery)
                 .map_err(PipelineError::Deliver)?

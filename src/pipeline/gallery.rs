@@ -22,6 +22,8 @@ pub(super) struct Portrait {
     pub(super) size_px: f64,
     /// What is known of its surface.
     pub(super) slant: Slant,
+    /// Pairs that have shown it since the first that did.
+    pub(super) age: u32,
     /// Pairs in a row in which it should have been seen and was not.
     pub(super) missed: u32,
     /// Whether the present pair shows it.

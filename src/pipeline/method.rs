@@ -8,7 +8,9 @@ use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
 use crate::estimation::sources::{Exposure, RigErrors};
-use crate::estimation::{self, Counts, Odometer, Odometry, PairStamp, Start, StereoMeasurement};
+use crate::estimation::{
+    self, Counts, Odometer, Odometry, PairStamp, Start, StereoMeasurement, TrackedFeature,
+};
 use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
 use crate::matching::{
@@ -112,6 +114,7 @@ pub struct Method {
     bench: Workbench,
     estimator: Estimator,
     times: StageTimes,
+    has_stepped: bool,
 }
 
 impl Method {
@@ -150,6 +153,7 @@ impl Method {
             bench,
             estimator,
             times: StageTimes::default(),
+            has_stepped: false,
         })
     }
 
@@ -179,6 +183,7 @@ impl Method {
     /// Its features could not be matched. The method stands as before the pair, which is then to be
     /// [skipped](Self::skip).
     pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, MatchError> {
+        self.has_stepped = false;
         std::mem::swap(&mut self.bench.now.pair, pair);
         let started = Instant::now();
         self.bench.matched = None;
@@ -194,12 +199,14 @@ impl Method {
             matching: matched - started,
             estimation: matched.elapsed(),
         };
+        self.has_stepped = true;
         Ok(row)
     }
 
     /// Takes note of a pair that could not be used at all.
     pub fn skip(&mut self, stamp: PairStamp) -> Odometry {
         self.times = StageTimes::default();
+        self.has_stepped = false;
         match &mut self.bench.odometer {
             Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
             Some(odometer) => odometer.begin(stamp, Counts::default()),
@@ -208,6 +215,18 @@ impl Method {
                 .new_odometer(stamp)
                 .begin(stamp, Counts::default()),
         }
+    }
+
+    /// The features of the last [`step`](Self::step)'s pair that its estimate rests on, and those that are
+    /// followed from it on; none where its motion could not be measured, and after a [`skip`](Self::skip).
+    pub fn tracked(&self) -> impl Iterator<Item = TrackedFeature> + '_ {
+        let (window, two_frame) = match &self.estimator {
+            Estimator::Window(estimator) => (Some(estimator.tracked()), None),
+            Estimator::TwoFrame(estimator) => (None, Some(estimator.tracked(&self.bench.rig))),
+        };
+        let window = window.into_iter().flatten();
+        let features = window.chain(two_frame.into_iter().flatten());
+        features.filter(|_| self.has_stepped)
     }
 
     /// How long the stages of the last [`step`](Self::step) took; zero after a

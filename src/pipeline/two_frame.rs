@@ -6,6 +6,7 @@ use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::sources::Exposure;
 use crate::estimation::{
     self, MeasuredMotion, MotionMeter, MotionTracks, Odometer, Odometry, Settings, Status,
+    TrackedFeature,
 };
 use crate::geometry::StereoRig;
 use crate::matching::MatchError;
@@ -16,32 +17,44 @@ use std::time::Instant;
 pub(super) struct TwoFrame {
     reference: Seen,
     /// The track of each of the reference's stereo matches.
-    reference_ids: Vec<u64>,
+    reference_tracks: Vec<Thread>,
     reference_exposure: Exposure,
     next_id: u64,
-    now_ids: Vec<u64>,
-    tracked: Vec<(u64, TrackedPoint)>,
+    now_tracks: Vec<Thread>,
+    tracked: Vec<(Thread, TrackedPoint)>,
     ids: Vec<u64>,
     points: Vec<TrackedPoint>,
     meter: MotionMeter,
+    /// Whether the meter has measured the present motion.
+    has_measured: bool,
+}
+
+/// A track through the pairs.
+#[derive(Clone, Copy, Debug, Default)]
+struct Thread {
+    id: u64,
+    /// Pairs that have shown it since the first that did.
+    age: u32,
 }
 
 impl TwoFrame {
     pub(super) fn new(rig: &StereoRig, settings: &Settings) -> Self {
         Self {
             reference: Seen::default(),
-            reference_ids: Vec::new(),
+            reference_tracks: Vec::new(),
             reference_exposure: Exposure::default(),
             next_id: 0,
-            now_ids: Vec::new(),
+            now_tracks: Vec::new(),
             tracked: Vec::new(),
             ids: Vec::new(),
             points: Vec::new(),
             meter: MotionMeter::new(rig, settings),
+            has_measured: false,
         }
     }
 
     pub(super) fn step(&mut self, bench: &mut Workbench) -> Result<Odometry, MatchError> {
+        self.has_measured = false;
         let stamp = bench.now.pair.stamp();
         let Some(mut odometer) = bench.odometer.take() else {
             let mut odometer = bench.new_odometer(stamp);
@@ -59,6 +72,7 @@ impl TwoFrame {
             return Err(e);
         }
         let measured = self.measure_motion(bench, &odometer, &predicted);
+        self.has_measured = measured.is_some();
         if let Some(watch) = &mut bench.watch {
             watch.begin_sights();
             for point in &self.points {
@@ -86,21 +100,43 @@ impl TwoFrame {
         Ok(row)
     }
 
+    /// The features that the present motion was measured from.
+    pub(super) fn tracked<'a>(
+        &'a self,
+        rig: &'a StereoRig,
+    ) -> impl Iterator<Item = TrackedFeature> + 'a {
+        let agreed = self.meter.agreed().filter(|_| self.has_measured);
+        agreed.filter_map(|(id, point)| {
+            let at = self.tracked.binary_search_by_key(&id, |(t, _)| t.id).ok()?;
+            Some(TrackedFeature {
+                id,
+                age: self.tracked[at].0.age + 1,
+                measurement: point.now,
+                landmark: estimation::triangulate(rig, &point.now)?,
+            })
+        })
+    }
+
     /// Makes the present pair the reference; tracks keep their numbers.
     fn become_reference(&mut self, bench: &mut Workbench) {
-        self.now_ids.clear();
+        self.now_tracks.clear();
         let first = self.next_id;
-        self.now_ids.extend((first..).take(bench.now.matches.len()));
+        let new = (first..).take(bench.now.matches.len());
+        self.now_tracks.extend(new.map(|id| Thread { id, age: 0 }));
         self.next_id = first + bench.now.matches.len() as u64;
         for track in &bench.tracks {
             let (before, now) = (track.before as usize, track.now as usize);
-            if let (Some(id), Some(slot)) =
-                (self.reference_ids.get(before), self.now_ids.get_mut(now))
-            {
-                *slot = *id;
+            if let (Some(thread), Some(slot)) = (
+                self.reference_tracks.get(before),
+                self.now_tracks.get_mut(now),
+            ) {
+                *slot = Thread {
+                    age: thread.age + 1,
+                    ..*thread
+                };
             }
         }
-        std::mem::swap(&mut self.reference_ids, &mut self.now_ids);
+        std::mem::swap(&mut self.reference_tracks, &mut self.now_tracks);
         self.reference_exposure = bench.exposure;
         std::mem::swap(&mut self.reference, &mut bench.now);
     }
@@ -163,11 +199,12 @@ impl TwoFrame {
                 now: bench.now.measurements[track.now as usize],
                 inverse_depth,
             };
-            self.tracked.push((self.reference_ids[before], point));
+            self.tracked.push((self.reference_tracks[before], point));
         }
-        self.tracked.sort_unstable_by_key(|(id, _)| *id);
+        self.tracked.sort_unstable_by_key(|(thread, _)| thread.id);
         self.ids.clear();
-        self.ids.extend(self.tracked.iter().map(|(id, _)| *id));
+        self.ids
+            .extend(self.tracked.iter().map(|(thread, _)| thread.id));
         self.points.clear();
         self.points
             .extend(self.tracked.iter().map(|(_, point)| *point));

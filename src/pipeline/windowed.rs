@@ -6,7 +6,9 @@ use super::gallery::{Gallery, Portrait};
 use super::method::Workbench;
 use super::occupancy::Occupancy;
 use crate::estimation::window::{self, Window};
-use crate::estimation::{self, Odometer, Odometry, PairStamp, Settings, StereoMeasurement};
+use crate::estimation::{
+    self, Landmark, Odometer, Odometry, PairStamp, Settings, StereoMeasurement, TrackedFeature,
+};
 use crate::geometry::StereoRig;
 use crate::image::GrayImage;
 use crate::matching::MatchError;
@@ -48,6 +50,8 @@ pub(super) struct Windowed {
     is_known: Vec<bool>,
     occupancy: Occupancy,
     candidates: Vec<usize>,
+    /// Whether the newest frame of the window is the present pair.
+    holds_present: bool,
 }
 
 impl Windowed {
@@ -69,10 +73,12 @@ impl Windowed {
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
             candidates: Vec::new(),
+            holds_present: false,
         }
     }
 
     pub(super) fn step(&mut self, bench: &mut Workbench) -> Result<Odometry, MatchError> {
+        self.holds_present = false;
         let stamp = bench.now.pair.stamp();
         let Some(mut odometer) = bench.odometer.take() else {
             let mut odometer = bench.new_odometer(stamp);
@@ -89,6 +95,24 @@ impl Windowed {
         let row = self.track(bench, &mut odometer, &newest_from_now, stamp);
         bench.odometer = Some(odometer);
         Ok(row)
+    }
+
+    /// The landmarks that the present pair shows.
+    pub(super) fn tracked(&self) -> impl Iterator<Item = TrackedFeature> + '_ {
+        let newest = self.window.newest_serial().filter(|_| self.holds_present);
+        self.gallery.portraits.iter().filter_map(move |portrait| {
+            let landmark = self.window.landmark(portrait.id)?;
+            let last = landmark.observations.last();
+            let sight = last.filter(|sight| Some(sight.serial) == newest)?;
+            let newest_from_anchor = self.window.newest_from_anchor(landmark)?;
+            let (inverse_depth, cov) = landmark.seen_from(&newest_from_anchor)?;
+            Some(TrackedFeature {
+                id: portrait.id,
+                age: portrait.age,
+                measurement: sight.measurement,
+                landmark: Landmark::from_inverse_depth(&inverse_depth, &cov)?,
+            })
+        })
     }
 
     /// Adjusts the window to the present pair, or bridges it.
@@ -110,6 +134,7 @@ impl Windowed {
         let Some(tracked) = tracked else {
             return self.bridge(bench, odometer, stamp);
         };
+        self.holds_present = true;
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
@@ -131,6 +156,7 @@ impl Windowed {
         self.spare_images.extend(images);
         self.is_known.clear();
         self.is_known.resize(bench.now.matches.len(), false);
+        self.holds_present = true;
         self.promote(bench);
     }
 
@@ -359,6 +385,7 @@ impl Windowed {
             }
         }
         for portrait in &mut self.gallery.portraits {
+            portrait.age += u32::from(portrait.found);
             portrait.missed = if portrait.found {
                 0
             } else {
@@ -501,6 +528,7 @@ impl Windowed {
             px: coarse.left_px(),
             size_px,
             slant,
+            age: 0,
             missed: 0,
             found: true,
             disagreed: false,

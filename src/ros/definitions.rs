@@ -70,6 +70,10 @@ const DIAGNOSTIC_STATUS: Part = (
     "diagnostic_msgs/DiagnosticStatus",
     "byte OK=0\nbyte WARN=1\nbyte ERROR=2\nbyte STALE=3\nbyte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values\n",
 );
+const POINT_FIELD: Part = (
+    "sensor_msgs/PointField",
+    "uint8 INT8=1\nuint8 UINT8=2\nuint8 INT16=3\nuint8 UINT16=4\nuint8 INT32=5\nuint8 UINT32=6\nuint8 FLOAT32=7\nuint8 FLOAT64=8\nstring name\nuint32 offset\nuint8 datatype\nuint32 count\n",
+);
 const REGION_OF_INTEREST: Part = (
     "sensor_msgs/RegionOfInterest",
     "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify\n",
@@ -118,6 +122,13 @@ pub const COMPRESSED_IMAGE: Definition = Definition {
     name: "sensor_msgs/msg/CompressedImage",
     fields: "std_msgs/Header header\nstring format\nuint8[] data\n",
     parts: &[HEADER, TIME],
+};
+
+/// Points with whatever is known of each.
+pub const POINT_CLOUD2: Definition = Definition {
+    name: "sensor_msgs/msg/PointCloud2",
+    fields: "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\nuint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense\n",
+    parts: &[HEADER, TIME, POINT_FIELD],
 };
 
 /// Raw pixels.

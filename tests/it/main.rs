@@ -5,16 +5,26 @@
 #[cfg(test)]
 mod accuracy;
 #[cfg(test)]
+#[cfg(feature = "ipc")]
+mod bridge;
+#[cfg(test)]
+mod c_header;
+#[cfg(test)]
 mod calibrate;
 #[cfg(test)]
 mod evaluate;
 #[cfg(test)]
 mod features;
 #[cfg(test)]
+#[cfg(all(feature = "foxglove", feature = "ipc"))]
+mod foxglove;
+#[cfg(test)]
 mod frame_source;
 #[cfg(test)]
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod gige;
+#[cfg(test)]
+mod manners;
 #[cfg(test)]
 #[cfg(feature = "mcap")]
 mod mcap;

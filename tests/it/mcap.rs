@@ -5,6 +5,7 @@
 
 use super::frame_source::{Expected, assert_conforms};
 use super::replay::{Recording, replay_quietly, stderr_of, visod};
+use nalgebra::{Point3, Vector4};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::process::Command;
@@ -15,6 +16,7 @@ use visod::capture::mcap::McapRecording;
 use visod::capture::{Dataset, PairEvent, PairSource, ReadAhead, StereoPair};
 use visod::image::GrayImage;
 use visod::output::csv::read_odometry_csv;
+use visod::output::row::OdometryRow;
 
 /// A recording and the MCAP file that its replay wrote.
 struct Written {
@@ -201,14 +203,14 @@ fn json_of(command: &mut Command) -> Value {
 
 /// Everything that ROS 2's readers make of a file, as JSON.
 const READ: &str = r#"
-import hashlib, io, json, sys
+import hashlib, io, json, sys, numpy as np
 from mcap_ros2.reader import read_ros2_messages
 from PIL import Image
 
 def xyz(v): return [v.x, v.y, v.z]
 def xyzw(q): return [q.x, q.y, q.z, q.w]
 
-counts, poses, images, frames, infos = {}, [], {}, [], {}
+counts, poses, images, frames, infos, clouds = {}, [], {}, [], {}, []
 for m in read_ros2_messages(sys.argv[1]):
     topic, r = m.channel.topic, m.ros_msg
     counts[topic] = counts.get(topic, 0) + 1
@@ -223,9 +225,16 @@ for m in read_ros2_messages(sys.argv[1]):
         frames += [[t.header.frame_id, t.child_frame_id] for t in r.transforms]
     elif topic.endswith('camera_info'):
         infos[topic] = dict(k=list(r.k), p=list(r.p), width=r.width)
+    elif topic == '/visod/features':
+        kinds = {6: '<u4', 7: '<f4'}
+        names = np.dtype([(f.name, kinds[f.datatype]) for f in r.fields])
+        points = np.frombuffer(bytes(r.data), names)
+        assert [f.offset for f in r.fields] == [4 * i for i in range(len(r.fields))]
+        assert (len(points), names.itemsize, r.row_step) == (r.width, r.point_step, len(r.data))
+        clouds.append([[float(v) for v in p] for p in points])
     elif topic == '/diagnostics':
         assert r.status[0].name == 'visod: odometry', r
-json.dump(dict(counts=counts, poses=poses, images=images, frames=frames, infos=infos), sys.stdout)
+json.dump(dict(counts=counts, poses=poses, images=images, frames=frames, infos=infos, clouds=clouds), sys.stdout)
 "#;
 
 #[test]
@@ -241,6 +250,7 @@ fn the_readers_of_ros_2_find_every_value() {
     let n = rows.len() as u64;
     for (topic, count) in [
         ("/visod/odometry", n),
+        ("/visod/features", n),
         ("/tf", n),
         ("/tf_static", 1),
         ("/left/image_raw/compressed", n),
@@ -282,7 +292,28 @@ fn the_readers_of_ros_2_find_every_value() {
     let frames = serde_json::json!([["odom", "odom_optical"], ["left_optical", "right_optical"]]);
     assert_eq!(read["frames"], frames);
     assert_eq!(read["infos"]["/left/camera_info"]["width"], 320);
+    check_clouds(&read["clouds"], &rows);
     assert!(read["infos"]["/right/camera_info"]["p"][3].as_f64() < Some(0.0));
+}
+
+/// Each pair's features are as many as its estimate rests on, older from pair to pair, and where both
+/// images show them.
+fn check_clouds(clouds: &Value, rows: &[OdometryRow]) {
+    let rig = visod::simulation::small_rig();
+    let mut oldest = 0.0;
+    for (cloud, row) in clouds.as_array().unwrap().iter().zip(rows) {
+        let points: Vec<Vec<f64>> = serde_json::from_value(cloud.clone()).unwrap();
+        assert!(points.len() as u64 >= u64::from(row.counts.inliers).max(20));
+        let mut off_px = 0.0;
+        for p in &points {
+            assert!(p[9] > 0.0 && p[12] > 0.0 && p[14] > 0.0, "{p:?}");
+            let seen = rig.project(&Point3::new(p[0], p[1], p[2])).unwrap();
+            off_px += (seen - Vector4::new(p[5], p[6], p[7], p[8])).norm() / points.len() as f64;
+        }
+        assert!(off_px < 0.5, "{off_px} px");
+        oldest = points.iter().map(|p| p[3]).fold(oldest, f64::max);
+    }
+    assert!(oldest >= 3.0, "{oldest}");
 }
 
 /// Writes a folder's images as ROS 2's stereo drivers do: raw pixels and calibrations, the right

@@ -1,18 +1,21 @@
 //! Publisher and `visod listen` as two processes.
 
-use nalgebra::{Isometry3, Matrix6, Vector3, Vector6};
+use nalgebra::{Isometry3, Matrix3, Matrix6, Point3, Vector3, Vector4, Vector6};
 use std::io::{BufRead, BufReader, Read};
 use std::process::{Child, Command, Output, Stdio};
 use std::sync::atomic::{AtomicU32, Ordering};
 use std::time::Duration;
-use visod::estimation::{Counts, ErrorBudget, Odometry, Status};
+use visod::estimation::{
+    Counts, ErrorBudget, Landmark, Odometry, Status, StereoMeasurement, TrackedFeature,
+};
 use visod::output::csv::{HEADER, OdometryCsvWriter, push_row};
+use visod::output::features::FeaturesMessage;
 use visod::output::health::{CameraState, HealthMessage};
 use visod::output::message::{CaptureTime, Latencies, OdometryMessage};
 use visod::output::publication::Settings;
 use visod::output::publisher::Publisher;
 use visod::output::row::OdometryRow;
-use visod::output::subscriber::{HealthSubscriber, OdometrySubscriber, Wake};
+use visod::output::subscriber::{FeaturesSubscriber, HealthSubscriber, OdometrySubscriber, Wake};
 
 /// Longer than anything here takes, even on a busy machine.
 pub(crate) const PATIENCE: Duration = Duration::from_secs(60);
@@ -36,6 +39,14 @@ impl System {
         Self {
             directory,
             settings,
+        }
+    }
+
+    /// The settings, with features published.
+    pub(crate) fn with_features(&self) -> Settings {
+        Settings {
+            features: true,
+            ..self.settings.clone()
         }
     }
 
@@ -142,6 +153,33 @@ pub(crate) fn message(sequence: u64) -> OdometryMessage {
     };
     let stamp = CaptureTime::Recorded(odometry.timestamp_ns);
     OdometryMessage::new(&odometry, None, stamp, latencies)
+}
+
+/// As many features as are asked for, none like another.
+pub(crate) fn features(sequence: u64, count: u64) -> Box<FeaturesMessage> {
+    let odometry = odometry(sequence);
+    let tracked = (0..count).map(|i| {
+        let v = i as f64;
+        TrackedFeature {
+            id: 1000 + i,
+            age: i as u32 % 9,
+            measurement: StereoMeasurement {
+                px: Vector4::new(v, v / 3.0, v - 20.0, v / 3.0 + 0.1),
+                sigma_px: Vector4::repeat(0.3),
+            },
+            landmark: Landmark {
+                point: Point3::new(v / 7.0, -v / 9.0, 3.0 + v),
+                cov_m2: Matrix3::from_fn(|i, j| if i == j { v } else { (i + j) as f64 / 7.0 }),
+            },
+        }
+    });
+    let mut message = Box::<FeaturesMessage>::default();
+    message.fill(
+        &odometry,
+        CaptureTime::Recorded(odometry.timestamp_ns),
+        tracked,
+    );
+    message
 }
 
 fn finished(child: Child) -> Output {
@@ -261,6 +299,71 @@ fn lines_for_the_eye_hold_pose_sigma_rate_and_latency() {
     for part in ["2 degraded", "x +0.200 ±0.173", "rx", "Hz", "transport"] {
         assert!(last.contains(part), "{part} is not in {last}");
     }
+}
+
+/// What a terminal of 120 columns is sent.
+fn on_a_terminal(system: &System, environment: &[(&str, &str)], messages: u64) -> String {
+    let command = format!(
+        "stty cols 120 rows 40; exec {} listen --count {messages} --service-root {} --service-prefix {}",
+        env!("CARGO_BIN_EXE_visod"),
+        system.root(),
+        system.prefix()
+    );
+    let listener = Command::new("script")
+        .args(["--quiet", "--return", "--command", &command, "/dev/null"])
+        .env("TERM", "xterm-256color")
+        .env_remove("NO_COLOR")
+        .envs(environment.iter().copied())
+        .stdin(Stdio::null())
+        .stdout(Stdio::piped())
+        .stderr(Stdio::piped())
+        .spawn()
+        .unwrap();
+    let mut publisher = Publisher::new(&system.settings).unwrap();
+    assert!(publisher.wait_for_subscribers(1, PATIENCE));
+    for sequence in 0..messages {
+        publisher.publish(&message(sequence)).unwrap();
+    }
+    let output = finished(listener);
+    assert!(output.status.success(), "{}", stderr_of(&output));
+    stdout_of(&output)
+}
+
+#[test]
+fn a_terminal_is_shown_a_picture_in_place() {
+    let system = System::new();
+    let sent = on_a_terminal(&system, &[], 30);
+    let last = &sent[sent.rfind("visod").unwrap()..];
+    for part in [
+        "pair 29",
+        "± 0.",
+        "Hz",
+        "latency",
+        "position",
+        "rotation",
+        "detection",
+    ] {
+        assert!(last.contains(part), "{part} is not in {last}");
+    }
+    assert!(sent.contains("\x1b[36m"), "no colour in {sent}");
+    // Less than a line a message: pictures are drawn over one another, and not each message is.
+    assert!(sent.matches("variance factor").count() < 30);
+    assert_eq!(
+        sent.matches("variance factor").count(),
+        sent.matches("\x1b[0J").count()
+    );
+}
+
+#[test]
+fn no_color_means_no_colour() {
+    let system = System::new();
+    let sent = on_a_terminal(&system, &[("NO_COLOR", "1")], 5);
+    assert!(sent.contains("pair 4"));
+    assert!(!sent.contains("\x1b[3"), "{sent}");
+    // A terminal that cannot move its cursor gets lines.
+    let sent = on_a_terminal(&System::new(), &[("TERM", "dumb")], 5);
+    assert_eq!(sent.lines().count(), 5, "{sent}");
+    assert!(!sent.contains('\x1b'), "{sent}");
 }
 
 #[test]
@@ -514,6 +617,33 @@ fn what_is_not_valid_is_not_published() {
     broken.cov_pose[7] = f64::NAN;
     let refusal = publisher.publish(&broken).unwrap_err().to_string();
     assert_eq!(refusal, "field cov_pose of the message is NaN at index 7");
+}
+
+#[test]
+fn features_arrive_where_they_are_wanted() {
+    let system = System::new();
+    let mut subscriber = FeaturesSubscriber::new("test", &system.settings).unwrap();
+    let mut without = Publisher::new(&system.settings).unwrap();
+    assert!(!without.publishes_features());
+    assert_eq!(without.publish_features(&features(0, 5)), Ok(0));
+    drop(without);
+    let mut publisher = Publisher::new(&system.with_features()).unwrap();
+    // More than wait for a subscriber: the oldest are overwritten, and counted.
+    for sequence in 0..11 {
+        assert_eq!(
+            publisher.publish_features(&features(sequence, 40 * sequence)),
+            Ok(1)
+        );
+    }
+    for sequence in 3..11 {
+        assert_eq!(subscriber.wait(PATIENCE), Ok(Wake::Message));
+        let received = subscriber.receive().unwrap().unwrap();
+        assert_eq!(received.message.message_number, sequence);
+        let mut sent = features(sequence, 40 * sequence);
+        sent.message_number = sequence;
+        sent.published_monotonic_ns = received.message.published_monotonic_ns;
+        assert_eq!(received.message, *sent);
+    }
 }
 
 #[test]

@@ -3,14 +3,14 @@
 use super::accuracy::test_recording;
 use super::publication::{PATIENCE, System};
 use super::replay::{PAIRS, Recording, Replayed, replay, stderr_of};
-use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion};
+use nalgebra::{Isometry3, Quaternion, Translation3, UnitQuaternion, Vector4};
 use serde_json::Value;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
 use visod::geometry::{load_rig, rig_to_toml};
 use visod::output::health::CameraState;
 use visod::output::publisher::Publisher;
-use visod::output::subscriber::HealthSubscriber;
+use visod::output::subscriber::{FeaturesSubscriber, HealthSubscriber, Wake};
 
 /// A configuration that publishes in `system`.
 fn config_for(system: &System, folder: &Path) -> PathBuf {
@@ -42,6 +42,61 @@ fn heard(recording: &Path, pairs: u64) -> (Replayed, Vec<String>) {
     assert!(output.status.success(), "{}", stderr_of(&output));
     let text = String::from_utf8(output.stdout).unwrap();
     (run, text.lines().map(str::to_owned).collect())
+}
+
+/// The features that a replay by one method publishes: each pair's, with what its row rests on.
+#[test]
+fn features_of_a_replay_are_where_both_images_show_them() {
+    let recording = Recording::shared();
+    let rig = load_rig(&recording.path().join("rig.toml")).unwrap();
+    for method in ["window", "bundle"] {
+        let system = System::new();
+        let folder = tempfile::tempdir().unwrap();
+        let config = config_for(&system, folder.path());
+        let mut text = std::fs::read_to_string(&config).unwrap();
+        text.push_str(&format!(
+            "features = true\n[estimation]\nmethod = \"{method}\"\n"
+        ));
+        std::fs::write(&config, text).unwrap();
+        let mut subscriber = FeaturesSubscriber::new("test", &system.settings).unwrap();
+        let heard = std::thread::spawn(move || {
+            let mut heard = Vec::new();
+            while (heard.len() as u64) < PAIRS {
+                assert_eq!(subscriber.wait(PATIENCE), Ok(Wake::Message));
+                let received = subscriber.receive().unwrap().unwrap();
+                assert_eq!(received.lost_before, 0);
+                heard.push(Box::new(received.message));
+            }
+            heard
+        });
+        let run = replay(recording.path(), &["--config", config.to_str().unwrap()]);
+        assert_eq!(stderr_of(&run.output), "");
+        let mut oldest = 0;
+        for (message, row) in heard.join().unwrap().iter().zip(&run.rows) {
+            assert_eq!(message.sequence, row.sequence);
+            assert!(message.count + message.left_out >= row.counts.inliers);
+            assert!(message.in_use().is_sorted_by_key(|f| f.id));
+            let mut off_px = 0.0;
+            for f in message.in_use() {
+                assert!(u64::from(f.age) <= row.sequence);
+                assert!(
+                    [f.cov_m2[0], f.cov_m2[3], f.cov_m2[5]]
+                        .iter()
+                        .all(|v| *v > 0.0)
+                );
+                let seen = rig.project(&f.point_m.into()).unwrap();
+                let [x, y] = f.left_px.map(f64::from);
+                let [right_x, right_y] = f.right_px.map(f64::from);
+                off_px += (seen - Vector4::new(x, y, right_x, right_y)).norm();
+                oldest = oldest.max(f.age);
+            }
+            assert!(
+                off_px <= 0.5 * f64::from(message.count),
+                "{method}: {off_px} px"
+            );
+        }
+        assert!(oldest >= 3, "{method}: {oldest}");
+    }
 }
 
 /// Every column of the CSV stands in the message with the same text.

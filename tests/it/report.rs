@@ -26,7 +26,7 @@ fn write_odometry(path: &Path, count: u64) {
             latency_ms: None,
             epoch: 0,
             innovation_ratio: f64::NAN,
-            budget_sigmas: [0.0; 24],
+            budget_sigmas: std::array::from_fn(|i| 1e-4 * ((i % 5) as f64)),
             is_first_order: true,
         };
         writer.write_row(&row).unwrap();
@@ -62,6 +62,113 @@ fn a_page_is_written_with_and_without_truth() {
         assert!(page.contains("<h1>Odometry drive &lt;1&gt;</h1>"));
         assert_eq!(page.contains("Error of the pose"), !truth.is_empty());
     }
+}
+
+/// Chromium without a window and without a network, or none.
+fn chromium(folder: &Path) -> Option<Command> {
+    let able = Command::new("chromium").arg("--version").output();
+    if !able.is_ok_and(|output| output.status.success()) {
+        println!("skipped: there is no chromium");
+        return None;
+    }
+    let mut command = Command::new("chromium");
+    command
+        .current_dir(folder)
+        .arg(format!(
+            "--user-data-dir={}",
+            folder.join("profile").display()
+        ))
+        .args([
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--no-first-run",
+        ])
+        .args([
+            "--disable-background-networking",
+            "--disable-component-update",
+        ])
+        .args(["--disable-sync", "--disable-quic", "--hide-scrollbars"])
+        .args(["--window-size=1120,3200", "--virtual-time-budget=2000"]);
+    Some(command)
+}
+
+/// The page in a browser: its script has gone through, zooming zooms, every figure is painted, and on paper
+/// it takes more than one sheet.
+#[test]
+fn a_browser_shows_the_page() {
+    let folder = tempfile::tempdir().unwrap();
+    let Some(mut browser) = chromium(folder.path()) else {
+        return;
+    };
+    write_odometry(&folder.path().join("drive.csv"), 40);
+    let truth: String = (0..40)
+        .map(|i| format!("1 0 0 0.01 0 1 0 0 0 0 1 {i}\n"))
+        .collect();
+    std::fs::write(folder.path().join("truth.txt"), truth).unwrap();
+    let args = [
+        "drive.csv",
+        "--ground-truth",
+        "truth.txt",
+        "-o",
+        "page.html",
+    ];
+    assert!(report(folder.path(), &args).status.success());
+    let page = std::fs::read_to_string(folder.path().join("page.html")).unwrap();
+    let figures = page.matches("<figure>").count();
+    assert!(figures >= 6, "{figures}");
+
+    // The same page with a hand that presses every figure's first button, which zooms in.
+    let hand = "<script>document.querySelectorAll('.tools button:first-child').forEach(b => b.click());\n\
+        document.documentElement.dataset.zoomed = document.querySelectorAll('.zoomed').length;</script></body>";
+    std::fs::write(
+        folder.path().join("pressed.html"),
+        page.replace("</body>", hand),
+    )
+    .unwrap();
+    let url = |name: &str| format!("file://{}", folder.path().join(name).display());
+    let output = browser
+        .args(["--dump-dom", &url("pressed.html")])
+        .output()
+        .unwrap();
+    let dom = String::from_utf8(output.stdout).unwrap();
+    for marker in ["figures", "zoomed"] {
+        let marker = format!("data-{marker}=\"{figures}\"");
+        assert!(
+            dom.contains(&marker),
+            "no {marker} in {}",
+            &dom[..dom.len().min(400)]
+        );
+    }
+
+    let mut browser = chromium(folder.path()).unwrap();
+    let taken = browser
+        .args(["--screenshot=page.png", &url("page.html")])
+        .output()
+        .unwrap();
+    assert!(taken.status.success(), "{taken:?}");
+    let picture = image::open(folder.path().join("page.png"))
+        .unwrap()
+        .to_rgb8();
+    assert_eq!(picture.dimensions(), (1120, 3200));
+    let ground = *picture.get_pixel(2, 2);
+    // Each band of 400 px holds something, and the whole more than a few colours.
+    for (n, band) in picture.chunks(3 * 1120 * 400).enumerate() {
+        let painted = band.chunks(3).filter(|p| *p != ground.0).count();
+        assert!(painted > 2000, "band {n}: {painted}");
+    }
+    let colours: std::collections::HashSet<_> = picture.pixels().map(|p| p.0).collect();
+    assert!(colours.len() > 100, "{}", colours.len());
+
+    let mut browser = chromium(folder.path()).unwrap();
+    let printed = browser
+        .args(["--print-to-pdf=page.pdf", &url("page.html")])
+        .output()
+        .unwrap();
+    assert!(printed.status.success(), "{printed:?}");
+    let paper = std::fs::read(folder.path().join("page.pdf")).unwrap();
+    let sheets = paper.windows(11).filter(|w| w == b"/Type /Page").count();
+    assert!(paper.starts_with(b"%PDF") && sheets > 2, "{sheets}");
 }
 
 #[test]

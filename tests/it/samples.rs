@@ -72,6 +72,7 @@ fn all_keys() -> BTreeSet<String> {
     config.publish.prefix = Some("robot1_".to_owned());
     config.last_pose.file = Some("/var/lib/visod/last_pose.toml".into());
     config.metrics.listen = Some("127.0.0.1:9477".to_owned());
+    config.publish.foxglove = visod::output::publication::FOXGLOVE_ADDRESS.parse().ok();
     keys(&toml::Table::try_from(config).unwrap())
 }
 

@@ -26,7 +26,7 @@ def main() -> int:
                 print(f"listen.py: no odometry for {args.timeout} s", file=sys.stderr)
                 return 1
             if args.json:
-                print(json.dumps(dataclasses.asdict(estimate)), flush=True)
+                print(json.dumps(dataclasses.asdict(estimate), default=lambda a: a.tolist()), flush=True)
             else:
                 print(describe(estimate), flush=True)
             printed += 1

@@ -1,4 +1,4 @@
-"""visod's odometry and health in Python: shared memory in, dataclasses out.
+"""visod's odometry, features and health in Python: shared memory in, dataclasses out.
 
     from visod_client import OdometrySubscriber
 
@@ -7,7 +7,7 @@
             print(estimate.sequence, estimate.position_m, estimate.sigma_m)
 
 Needs `pip install -r requirements.txt`. The layouts are those of the crate's modules
-`output::message` and `output::health`, byte for byte. Run it as the user of the daemon: iceoryx2
+`output::message`, `output::features` and `output::health`, byte for byte. Run it as the user of the daemon: iceoryx2
 lets nobody else in, and says nothing about it.
 """
 
@@ -21,12 +21,16 @@ from dataclasses import dataclass
 from typing import Generic, Iterator, Optional, Tuple, TypeVar
 
 import iceoryx2 as iox2
+import numpy as np
+from numpy.typing import NDArray
 
 ODOMETRY_SERVICE = "visod/odometry"
+FEATURES_SERVICE = "visod/features"
 HEALTH_SERVICE = "visod/health"
+MAX_FEATURES = 512
 
 # Sizes of the services; whoever comes first creates them, so all must agree.
-_BUFFERS = {ODOMETRY_SERVICE: 512, HEALTH_SERVICE: 16}
+_BUFFERS = {ODOMETRY_SERVICE: 512, FEATURES_SERVICE: 8, HEALTH_SERVICE: 16}
 _MAX_SUBSCRIBERS = 16
 _MAX_PUBLISHERS = 4
 _MAX_NODES = 40
@@ -44,7 +48,26 @@ STAGES = ("capture", "features", "matching", "estimation", "total")
 _FLAG_REPLAY = 1
 _FLAG_BEYOND_FIRST_ORDER = 4
 
-Matrix = Tuple[Tuple[float, ...], ...]
+_VECTORS = (
+    "position_m", "orientation_xyzw", "motion_translation_m", "motion_rotation_xyzw", "twist",
+)  # fmt: skip
+_MATRICES = ("cov_pose", "cov_motion", "cov_twist")
+_UPPER = np.triu_indices(6)
+
+Array = NDArray[np.float64]
+
+# One entry of `visod/features`.
+FEATURE = np.dtype(
+    [
+        ("id", "<u8"),
+        ("age", "<u4"),
+        ("reserved", "<u4"),
+        ("left_px", "<f4", 2),
+        ("right_px", "<f4", 2),
+        ("point_m", "<f8", 3),
+        ("cov_m2", "<f8", 6),
+    ]
+)
 
 
 class MessageError(ValueError):
@@ -103,6 +126,37 @@ class OdometryMessage(ctypes.Structure):
         return "visod::OdometryMessage.1"
 
 
+class FeaturesMessage(ctypes.Structure):
+    """`visod/features`, layout version 1."""
+
+    MAGIC = int.from_bytes(b"VIOF", "little")
+    VERSION = 1
+    _fields_ = [
+        ("magic", ctypes.c_uint32),
+        ("version", ctypes.c_uint32),
+        ("size", ctypes.c_uint32),
+        ("flags", ctypes.c_uint32),
+        ("sequence", ctypes.c_uint64),
+        ("message_number", ctypes.c_uint64),
+        ("realtime_ns", ctypes.c_int64),
+        ("monotonic_ns", ctypes.c_int64),
+        ("published_monotonic_ns", ctypes.c_int64),
+        ("epoch", ctypes.c_uint32),
+        ("status", ctypes.c_uint32),
+        ("count", ctypes.c_uint32),
+        ("left_out", ctypes.c_uint32),
+        ("position_m", ctypes.c_double * 3),
+        ("orientation_xyzw", ctypes.c_double * 4),
+        # Doubles for their alignment; FEATURE says what they are.
+        ("features", ctypes.c_double * (MAX_FEATURES * FEATURE.itemsize // 8)),
+    ]
+
+    @staticmethod
+    def type_name() -> str:
+        """The name by which iceoryx2 knows that both sides mean the same layout."""
+        return "visod::FeaturesMessage.1"
+
+
 class HealthMessage(ctypes.Structure):
     """`visod/health`, layout version 1."""
 
@@ -158,9 +212,12 @@ class HealthMessage(ctypes.Structure):
         return "visod::HealthMessage.1"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Odometry:
-    """One estimate. Covariances are ordered x, y, z, rx, ry, rz (m², m·rad, rad²)."""
+    """One estimate. Covariances are ordered x, y, z, rx, ry, rz (m², m·rad, rad²).
+
+    Vectors and matrices are views of one copy of the message, read-only.
+    """
 
     sequence: int
     message_number: int
@@ -171,15 +228,15 @@ class Odometry:
     realtime_ns: int
     monotonic_ns: Optional[int]
     published_monotonic_ns: int
-    position_m: Tuple[float, ...]
-    orientation_xyzw: Tuple[float, ...]
-    cov_pose: Matrix
-    motion_translation_m: Tuple[float, ...]
-    motion_rotation_xyzw: Tuple[float, ...]
-    cov_motion: Matrix
-    twist: Tuple[float, ...]
-    cov_twist: Matrix
-    budget: dict[str, Optional[Matrix]]
+    position_m: Array  # (3,)
+    orientation_xyzw: Array  # (4,)
+    cov_pose: Array  # (6, 6)
+    motion_translation_m: Array  # (3,)
+    motion_rotation_xyzw: Array  # (4,)
+    cov_motion: Array  # (6, 6)
+    twist: Array  # (6,)
+    cov_twist: Array  # (6, 6)
+    budget: dict[str, Optional[Array]]  # (6, 6) each
     keypoints_left: int
     keypoints_right: int
     stereo_matches: int
@@ -191,24 +248,23 @@ class Odometry:
     latencies_ns: dict[str, Optional[int]]
 
     @property
-    def sigma_m(self) -> Tuple[float, ...]:
+    def sigma_m(self) -> Array:
         """1 σ of the position, m."""
-        return tuple(math.sqrt(max(self.cov_pose[i][i], 0.0)) for i in range(3))
+        return np.sqrt(np.maximum(np.diag(self.cov_pose)[:3], 0.0))
 
     @property
-    def sigma_rad(self) -> Tuple[float, ...]:
+    def sigma_rad(self) -> Array:
         """1 σ of the orientation about the fixed axes, rad."""
-        return tuple(math.sqrt(max(self.cov_pose[i][i], 0.0)) for i in range(3, 6))
+        return np.sqrt(np.maximum(np.diag(self.cov_pose)[3:], 0.0))
 
     @staticmethod
-    def from_message(m: OdometryMessage) -> "Odometry":
+    def from_message(message: OdometryMessage) -> "Odometry":
         """Checks a message and copies it out of shared memory."""
-        _check_layout(m, OdometryMessage)
-        finite = (
-            *m.position_m, *m.orientation_xyzw, *m.motion_translation_m,
-            *m.motion_rotation_xyzw, *m.twist, *m.cov_pose, *m.cov_motion, *m.cov_twist,
-        )  # fmt: skip
-        if not all(map(math.isfinite, finite)):
+        _check_layout(message, OdometryMessage)
+        m = OdometryMessage.from_buffer_copy(message)
+        vectors = {name: _view(getattr(m, name)) for name in _VECTORS}
+        matrices = {name: _view(getattr(m, name)).reshape(6, 6) for name in _MATRICES}
+        if not all(np.isfinite(a).all() for a in (*vectors.values(), *matrices.values())):
             raise MessageError("the message holds a number that is not finite")
         return Odometry(
             sequence=m.sequence,
@@ -220,16 +276,10 @@ class Odometry:
             realtime_ns=m.realtime_ns,
             monotonic_ns=m.monotonic_ns or None,
             published_monotonic_ns=m.published_monotonic_ns,
-            position_m=tuple(m.position_m),
-            orientation_xyzw=tuple(m.orientation_xyzw),
-            cov_pose=_full(m.cov_pose),
-            motion_translation_m=tuple(m.motion_translation_m),
-            motion_rotation_xyzw=tuple(m.motion_rotation_xyzw),
-            cov_motion=_full(m.cov_motion),
-            twist=tuple(m.twist),
-            cov_twist=_full(m.cov_twist),
+            **vectors,
+            **matrices,
             budget={
-                part: _symmetric(getattr(m, f"budget_{part}"))
+                part: _symmetric(_view(getattr(m, f"budget_{part}")))
                 if m.budget_modelled >> bit & 1
                 else None
                 for bit, part in enumerate(BUDGET_PARTS)
@@ -245,6 +295,48 @@ class Odometry:
             latencies_ns={
                 stage: getattr(m, f"latency_{stage}_ns") or None for stage in STAGES
             },
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """The features that an estimate rests on."""
+
+    sequence: int
+    message_number: int
+    epoch: int
+    status: str
+    replay: bool
+    realtime_ns: int
+    monotonic_ns: Optional[int]
+    published_monotonic_ns: int
+    left_out: int
+    position_m: Array  # (3,), of the left camera in the odometry frame
+    orientation_xyzw: Array  # (4,)
+    features: np.ndarray  # (n,) of FEATURE: id, age, left_px, right_px, point_m, cov_m2
+
+    @staticmethod
+    def from_message(message: FeaturesMessage) -> "Features":
+        """Checks a message and copies it out of shared memory."""
+        _check_layout(message, FeaturesMessage)
+        if message.count > MAX_FEATURES:
+            raise MessageError(f"the message says that it holds {message.count} features")
+        m = FeaturesMessage.from_buffer_copy(message)
+        features = np.frombuffer(m, FEATURE, m.count, FeaturesMessage.features.offset)
+        features.setflags(write=False)
+        return Features(
+            sequence=m.sequence,
+            message_number=m.message_number,
+            epoch=m.epoch,
+            status=_word(STATUSES, m.status, "status"),
+            replay=bool(m.flags & _FLAG_REPLAY),
+            realtime_ns=m.realtime_ns,
+            monotonic_ns=m.monotonic_ns or None,
+            published_monotonic_ns=m.published_monotonic_ns,
+            left_out=m.left_out,
+            position_m=_view(m.position_m),
+            orientation_xyzw=_view(m.orientation_xyzw),
+            features=features,
         )
 
 
@@ -344,17 +436,18 @@ def _word(words: Tuple[str, ...], code: int, field: str) -> str:
     return words[code]
 
 
-def _full(values) -> Matrix:
-    return tuple(tuple(values[6 * i : 6 * i + 6]) for i in range(6))
+def _view(array: ctypes.Array) -> Array:
+    view = np.ctypeslib.as_array(array)
+    view.setflags(write=False)
+    return view
 
 
-def _symmetric(triangle) -> Matrix:
-    entries = iter(triangle)
-    m = [[0.0] * 6 for _ in range(6)]
-    for i in range(6):
-        for j in range(i, 6):
-            m[i][j] = m[j][i] = next(entries)
-    return tuple(map(tuple, m))
+def _symmetric(triangle: Array) -> Array:
+    matrix = np.empty((6, 6))
+    matrix[_UPPER] = triangle
+    matrix.T[_UPPER] = triangle
+    matrix.setflags(write=False)
+    return matrix
 
 
 T = TypeVar("T")
@@ -482,6 +575,14 @@ class OdometrySubscriber(_Subscriber[Odometry]):
     _service = ODOMETRY_SERVICE
     _layout = OdometryMessage
     _decode = staticmethod(Odometry.from_message)
+
+
+class FeaturesSubscriber(_Subscriber[Features]):
+    """Receives the features that estimates rest on, where `publish.features` is set."""
+
+    _service = FEATURES_SERVICE
+    _layout = FeaturesMessage
+    _decode = staticmethod(Features.from_message)
 
 
 class HealthSubscriber(_Subscriber[Health]):

@@ -1,10 +1,10 @@
 //! A run in, its figures over time and distance out.
 
-use super::against_truth;
 use super::plot::{Frame, Panel};
 use super::run::{Run, sigma};
 use super::scale::{angle_unit, extent, length_unit};
 use super::svg;
+use super::{against_truth, budget};
 use crate::estimation::Status;
 
 /// Width of every drawing, px.
@@ -71,6 +71,7 @@ pub(super) fn all(run: &Run) -> Vec<Figure> {
     figures.extend(against_truth::errors(run));
     figures.extend(against_truth::nees(run));
     figures.push(sigmas(run));
+    figures.extend(budget::shares(run));
     figures.push(counts(run));
     figures.extend(variance_factor(run));
     figures.extend(latency(run));
@@ -151,31 +152,34 @@ fn height(run: &Run) -> Figure {
             .iter()
             .map(|row| -row.odom_from_camera.translation.y)
     };
-    let band: Vec<_> = run
-        .path_m
-        .iter()
-        .zip(run.rows)
-        .zip(heights())
-        .map(|((path, row), height)| {
-            let three_sigma = 3.0 * sigma(&row.cov_pose, 1);
-            (*path, height - three_sigma, height + three_sigma)
+    let band = |sigmas: f64| -> Vec<_> {
+        let rows = run.path_m.iter().zip(run.rows).zip(heights());
+        rows.map(|((path, row), height)| {
+            let reach = sigmas * sigma(&row.cov_pose, 1);
+            (*path, height - reach, height + reach)
         })
-        .collect();
+        .collect()
+    };
+    let (one_sigma, three_sigma) = (band(1.0), band(3.0));
     let truth: Vec<_> = run.truth.as_ref().map_or_else(Vec::new, |truth| {
         let heights = truth
             .iter()
             .map(|pose| pose.map_or(f64::NAN, |pose| -pose.translation.y));
         run.path_m.iter().copied().zip(heights).collect()
     });
-    let shown = band.iter().flat_map(|p| [p.1, p.2]).chain(heights());
+    let shown = three_sigma.iter().flat_map(|p| [p.1, p.2]).chain(heights());
     let end_m = run.path_m.last().copied().unwrap_or(0.0);
     let y = domain(shown.chain(truth.iter().map(|p| p.1)), None);
     let mut panel = Panel::new(stacked(0, HEIGHT_PX, 0.0), (0.0, end_m), y);
-    panel.band(&band, "band");
+    panel.band(&three_sigma, "band");
+    panel.band(&one_sigma, "band");
     panel.line(&truth, "truth");
     let points: Vec<_> = run.path_m.iter().copied().zip(heights()).collect();
     panel.line(&points, "one");
-    let mut legend = vec![Key::line("one", "estimate"), Key::area("band", "±3 σ")];
+    let mut legend = vec![
+        Key::line("one", "estimate"),
+        Key::area("band", "±1 σ and, lighter, ±3 σ"),
+    ];
     if run.truth.is_some() {
         legend.push(Key::line("truth", "truth"));
     }

@@ -4,13 +4,14 @@
 //! |---|---|
 //! | `run` | of rows and truth, what several figures need |
 //! | `facts` | the headline: a sentence and numbers |
-//! | `map`, `figures`, `against_truth` | the figures |
+//! | `map`, `figures`, `against_truth`, `budget` | the figures |
 //! | `plot`, `scale`, `svg` | panels, axes, elements |
 //! | `page` | the page around them |
 //!
 //! The page needs no network and no script; a script that it carries adds zoom and pan.
 
 mod against_truth;
+mod budget;
 mod facts;
 pub(crate) mod figures;
 mod map;

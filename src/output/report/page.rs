@@ -15,6 +15,9 @@ pub(crate) const SCRIPT: &str = include_str!("script.js");
 pub(crate) const PATTERNS: &str = r#"<svg class="patterns" aria-hidden="true"><defs>
 <pattern id="degraded" width="7" height="7" patternUnits="userSpaceOnUse"><rect class="warn" width="7" height="7"/><path class="ink" d="M-1,8L8,-1M-1,1L1,-1M6,8L8,6"/></pattern>
 <pattern id="lost" width="7" height="7" patternUnits="userSpaceOnUse"><rect class="bad" width="7" height="7"/><path class="ink" d="M0,0L7,7M7,0L0,7"/></pattern>
+<pattern id="part2" width="6" height="6" patternUnits="userSpaceOnUse"><rect class="two" width="6" height="6"/><path class="paper" d="M-1,7L7,-1M-1,1L1,-1M5,7L7,5"/></pattern>
+<pattern id="part3" width="5" height="5" patternUnits="userSpaceOnUse"><rect class="three" width="5" height="5"/><circle class="paper" cx="2.5" cy="2.5" r="0.9"/></pattern>
+<pattern id="part4" width="6" height="6" patternUnits="userSpaceOnUse"><rect class="four" width="6" height="6"/><path class="paper" d="M3,0V6M0,3H6"/></pattern>
 </defs></svg>
 "#;
 

@@ -33,7 +33,7 @@ fn rows(count: u64) -> Vec<OdometryRow> {
                 latency_ms: Some(20.0),
                 epoch: 0,
                 innovation_ratio: f64::NAN,
-                budget_sigmas: [0.0; 24],
+                budget_sigmas: std::array::from_fn(|i| 1e-3 * ((i % 7) as f64) * sequence as f64),
                 is_first_order: true,
             };
             pose *= step;
@@ -107,6 +107,7 @@ fn every_row_is_drawn() {
     );
     for heading in [
         "Path from above",
+        "Where the uncertainty comes from",
         "Status",
         "Height over distance",
         "Error of the pose",

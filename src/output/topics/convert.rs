@@ -19,13 +19,13 @@ pub(super) const OPTICAL: [&str; 2] = ["left_optical", "right_optical"];
 
 /// Names the frames of one rig.
 #[derive(Clone, Debug)]
-pub(super) struct Frames {
+pub(in crate::output) struct Frames {
     base_from_camera: Option<Isometry3<f64>>,
     right_from_left: Isometry3<f64>,
 }
 
 impl Frames {
-    pub(super) fn new(
+    pub(in crate::output) fn new(
         base_from_camera: Option<Isometry3<f64>>,
         right_from_left: Isometry3<f64>,
     ) -> Self {
@@ -44,7 +44,7 @@ impl Frames {
     }
 
     /// Pose and velocity, of the base where there is one.
-    pub(super) fn odometry(&self, camera: &Odometry) -> ros::Odometry {
+    pub(in crate::output) fn odometry(&self, camera: &Odometry) -> ros::Odometry {
         let moved = self.base_from_camera.map(|x| in_base_frame(camera, &x));
         let estimate = moved.as_ref().unwrap_or(camera);
         let [frame, child] = self.names();
