@@ -34,11 +34,11 @@ use nalgebra::{Matrix6, SMatrix, SVector, Vector2, Vector6};
 /// Regions of the image, across and down.
 const REGIONS: [usize; 2] = [4, 3];
 /// As many measurements count as if they had found nothing, at first.
-const PRIOR: u32 = 4;
+const PRIOR: u32 = 2;
 /// Share of a new measurement, once there are many.
 const GAIN: f64 = 0.05;
-/// What it may be above 1 by chance: twice what twelve regions' scores leave after smoothing.
-const CHANCE: f64 = 0.05;
+/// What it may be above 1 by chance: what twelve regions' scores leave after smoothing.
+const CHANCE: f64 = 0.03;
 
 /// A pose's derivative by itself through one other.
 type Block = Matrix6<f64>;
