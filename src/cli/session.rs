@@ -455,12 +455,7 @@ impl Session {
     /// Shows one row to Foxglove; where that fails nobody looks any more.
     #[cfg(feature = "foxglove")]
     fn present(&mut self, delivery: &Delivery<'_>) {
-        let capture_ns = self.live.as_ref().map_or(0, |live| {
-            let captured = live.cameras.captured(delivery.odometry.sequence);
-            captured.map_or(0, |at| {
-                u64::try_from(at.complete_ns - at.monotonic_ns).unwrap_or(0)
-            })
-        });
+        let (_, capture_ns) = self.captured(delivery);
         if let Some(server) = &mut self.foxglove {
             let shown = server.add(
                 delivery.odometry,
@@ -519,7 +514,7 @@ impl Session {
     }
 
     /// When a pair was taken, and how long it took to be complete, ns.
-    #[cfg(feature = "ipc")]
+    #[cfg(any(feature = "ipc", feature = "foxglove"))]
     fn captured(&self, delivery: &Delivery<'_>) -> (crate::output::message::CaptureTime, u64) {
         use crate::capture::camera::monotonic_ns;
         use crate::output::message::CaptureTime;

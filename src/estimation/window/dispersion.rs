@@ -182,7 +182,8 @@ fn add(at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: &m
         if frame == anchor {
             continue;
         }
-        let moved = along[frame] - product(&se3::adjoint(&from), &along[anchor]);
+        let carry = se3::adjoint(&from);
+        let moved = along[frame] - product(&carry, &along[anchor]);
         let seen_by_direction = product(&seen.by_motion, &moved);
         let weighted = transposed_scaled(&seen_by_direction, &info);
         information += product(&weighted, &seen_by_direction);
@@ -193,7 +194,6 @@ fn add(at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: &m
             product(&weighted, &seen_by_direction),
             product(&weighted, &seen_by_point),
         );
-        let carry = se3::adjoint(&from);
         by_direction[frame] += direction;
         by_direction[anchor] -= transposed_product(&carry, &direction);
         by_point[frame] += point;

@@ -104,12 +104,8 @@ impl Window {
             .enumerate()
             .filter(|(_, l)| l.anchor == oldest);
         let at = At {
-            rig: &self.rig,
-            warp: &self.warp,
-            frames: &self.frames,
             without: Some(newest),
-            variance_factor: self.variance.smoothed,
-            damping: 0.0,
+            ..At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed)
         };
         system.build(&at, leaving);
         let (mut hessian, mut gradient) = system.assemble(&mut self.memory);

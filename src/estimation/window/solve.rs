@@ -239,14 +239,7 @@ impl Window {
             .nth(1)
             .is_some_and(|f| f.is_keyframe)
         {
-            let at = At {
-                rig: &self.rig,
-                warp: &self.warp,
-                frames: &self.frames,
-                without: None,
-                variance_factor: self.variance.smoothed,
-                damping: 0.0,
-            };
+            let at = At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed);
             self.dispersion.take(&at, &self.landmarks, joint);
         }
     }
@@ -326,14 +319,7 @@ impl Window {
 
     /// The derivative of warp and poses by each source of error.
     fn by_sources(&mut self, joint: &Joint) -> UnknownsBySources {
-        let at = At {
-            rig: &self.rig,
-            warp: &self.warp,
-            frames: &self.frames,
-            without: None,
-            variance_factor: self.variance.smoothed,
-            damping: 0.0,
-        };
+        let at = At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed);
         let mut right =
             self.sensitivity
                 .right_side(&at, &self.errors, &self.system, &self.landmarks);
@@ -360,12 +346,8 @@ impl Window {
         damping: f64,
     ) -> (DMatrix<f64>, DVector<f64>, f64) {
         let at = At {
-            rig: &self.rig,
-            warp: &self.warp,
-            frames: &self.frames,
-            without: None,
-            variance_factor: self.variance.smoothed,
             damping,
+            ..At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed)
         };
         let cost = system.build(&at, self.landmarks.iter().enumerate());
         let (mut hessian, mut gradient) = system.assemble(memory);

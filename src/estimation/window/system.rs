@@ -29,6 +29,25 @@ pub(super) struct At<'a> {
     pub(super) damping: f64,
 }
 
+impl<'a> At<'a> {
+    /// All observations of a window, undamped.
+    pub(super) fn new(
+        rig: &'a StereoRig,
+        warp: &'a Warp,
+        frames: &'a [Frame],
+        variance_factor: f64,
+    ) -> Self {
+        Self {
+            rig,
+            warp,
+            frames,
+            without: None,
+            variance_factor,
+            damping: 0.0,
+        }
+    }
+}
+
 /// Normal equations, with the working memory for making them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct System {
