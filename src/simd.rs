@@ -1,27 +1,29 @@
 //! Wider registers where the processor has them.
 
-/// Defines `fn name(…)`, which calls the `#[inline(always)]` function `body` compiled for AVX2 where
-/// the processor has it, and as it is elsewhere.
+/// Defines `fn name(…)`, with or without a result, which calls the `#[inline(always)]` function `body`
+/// compiled for AVX2 where the processor has it, and as it is elsewhere.
 ///
 /// Nothing but the width changes: Rust neither reorders nor fuses floating-point operations, so
 /// either way the same operations give the same bits.
 macro_rules! widened {
-    ($(#[$attribute:meta])* $visibility:vis fn $name:ident = $body:path, ($($argument:ident: $type:ty),* $(,)?)) => {
+    (
+        $(#[$attribute:meta])*
+        $visibility:vis fn $name:ident = $body:path, ($($argument:ident: $type:ty),* $(,)?) $(-> $result:ty)?
+    ) => {
         $(#[$attribute])*
-        $visibility fn $name($($argument: $type),*) {
+        $visibility fn $name($($argument: $type),*) $(-> $result)? {
             #[cfg(target_arch = "x86_64")]
             {
                 #[target_feature(enable = "avx2")]
-                fn wide($($argument: $type),*) {
-                    $body($($argument),*);
+                fn wide($($argument: $type),*) $(-> $result)? {
+                    $body($($argument),*)
                 }
                 if std::is_x86_feature_detected!("avx2") {
                     // SAFETY: the processor has AVX2, as just asked.
-                    unsafe { wide($($argument),*) };
-                    return;
+                    return unsafe { wide($($argument),*) };
                 }
             }
-            $body($($argument),*);
+            $body($($argument),*)
         }
     };
 }

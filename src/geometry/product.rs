@@ -6,7 +6,7 @@
 use nalgebra::SMatrix;
 
 /// `a b`.
-#[inline]
+#[inline(always)]
 pub(crate) fn product<const R: usize, const K: usize, const C: usize>(
     a: &SMatrix<f64, R, K>,
     b: &SMatrix<f64, K, C>,
@@ -24,7 +24,7 @@ pub(crate) fn product<const R: usize, const K: usize, const C: usize>(
 }
 
 /// `a bᵀ`.
-#[inline]
+#[inline(always)]
 pub(crate) fn product_transposed<const R: usize, const K: usize, const C: usize>(
     a: &SMatrix<f64, R, K>,
     b: &SMatrix<f64, C, K>,
@@ -42,7 +42,7 @@ pub(crate) fn product_transposed<const R: usize, const K: usize, const C: usize>
 }
 
 /// `aᵀ b`.
-#[inline]
+#[inline(always)]
 pub(crate) fn transposed_product<const R: usize, const K: usize, const C: usize>(
     a: &SMatrix<f64, K, R>,
     b: &SMatrix<f64, K, C>,
@@ -60,7 +60,7 @@ pub(crate) fn transposed_product<const R: usize, const K: usize, const C: usize>
 }
 
 /// `aᵀ diag(d)`.
-#[inline]
+#[inline(always)]
 pub(crate) fn transposed_scaled<const R: usize, const C: usize>(
     a: &SMatrix<f64, R, C>,
     d: &SMatrix<f64, R, 1>,
@@ -75,7 +75,7 @@ pub(crate) fn transposed_scaled<const R: usize, const C: usize>(
 }
 
 /// Takes `a bᵀ` off `out`.
-#[inline]
+#[inline(always)]
 pub(crate) fn subtract_product_transposed<const R: usize, const K: usize, const C: usize>(
     out: &mut SMatrix<f64, R, C>,
     a: &SMatrix<f64, R, K>,

@@ -6,7 +6,13 @@
 //! surface's slope is estimated along with the translation, by what is known of it before; a
 //! translation that stands for a slope would be off.
 
+#![expect(
+    clippy::needless_range_loop,
+    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
+)]
+
 use crate::image::GrayImage;
+use crate::simd::widened;
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 /// Half the side of a patch, samples.
@@ -15,12 +21,17 @@ pub(super) const HALF: usize = 5;
 const SIDE: usize = 2 * HALF + 1;
 /// Samples of a patch.
 const AREA: usize = SIDE * SIDE;
-/// Floats that hold them, zeros at the end: a multiple of what registers hold.
-const ROOM: usize = AREA.next_multiple_of(LANES);
+/// Floats that hold them, zeros at the end: a multiple of what registers hold, and room for a last row of
+/// whole registers.
+const ROOM: usize = (AREA - SIDE + WIDE_SIDE).next_multiple_of(LANES);
 /// Sums that run side by side.
 const LANES: usize = 8;
+/// A side of whole registers.
+const WIDE_SIDE: usize = SIDE.next_multiple_of(LANES);
 /// A side of the template with the rim that its gradients need.
 const RIM_SIDE: usize = SIDE + 2;
+/// Samples of a template with its rim.
+const RIM_AREA: usize = RIM_SIDE * RIM_SIDE;
 /// Room that a patch needs around its centre in the target, px of the level.
 const MARGIN: f32 = HALF as f32 + 1.0;
 
@@ -109,33 +120,11 @@ impl Template {
         warp: &Warp,
         surface: &Surface,
     ) -> Option<Self> {
-        let mut wide = [0.0_f32; RIM_SIDE * RIM_SIDE];
-        let reach = (HALF + 1) as f32;
-        let nearest = 1.0 - reach * warp.depth.abs().sum();
-        if nearest < 0.5 {
-            return None;
-        }
-        let linear = &warp.linear;
-        let extent = Vector2::new(
-            linear[(0, 0)].abs() + linear[(0, 1)].abs(),
-            linear[(1, 0)].abs() + linear[(1, 1)].abs(),
-        ) * (reach / nearest);
-        if !holds(image, centre, &extent) {
-            return None;
-        }
-        for row in 0..RIM_SIDE {
-            for column in 0..RIM_SIDE {
-                let grid = Vector2::new(column as f32 - reach, row as f32 - reach);
-                wide[row * RIM_SIDE + column] = sample(
-                    image,
-                    &(centre + linear * grid / (1.0 - warp.depth.dot(&grid))),
-                );
-            }
-        }
-        Self::from_samples(&wide, surface)
+        template(image, centre, warp, surface)
     }
 
-    fn from_samples(wide: &[f32; RIM_SIDE * RIM_SIDE], surface: &Surface) -> Option<Self> {
+    #[inline(always)]
+    fn from_samples(wide: &[f32; RIM_AREA], surface: &Surface) -> Option<Self> {
         let mut values = [0.0; ROOM];
         let mut by = [[0.0; ROOM]; 4];
         let lever = surface.lever.map(|v| v as f32);
@@ -198,34 +187,7 @@ impl Template {
     /// that looks different.
     #[must_use]
     pub fn align(&self, image: &GrayImage, start: &Vector2<f32>, reach: f32) -> Option<Aligned> {
-        let inverse = (self.normal + self.known.0 * USUAL_VARIANCE)
-            .cholesky()?
-            .inverse();
-        let mut at = *start;
-        let mut seen = [0.0; ROOM];
-        for _ in 0..MAX_ITERATIONS {
-            if !holds(image, &at, &Vector2::repeat(MARGIN)) || (at - start).amax() > reach {
-                return None;
-            }
-            sample_square(image, &at, &mut seen);
-            centre_on_zero(&mut seen);
-            let gain = dot(&seen, &self.values) / self.energy;
-            if gain <= 0.1 {
-                return None;
-            }
-            let energy = dot(&seen, &seen);
-            for (s, v) in seen.iter_mut().zip(&self.values) {
-                *s = *s / gain - v;
-            }
-            let gradient = Vector4::from(self.by.each_ref().map(|by| f64::from(dot(by, &seen))));
-            let step = inverse * (gradient + self.known.1 * USUAL_VARIANCE);
-            if step.xy().amax() < MIN_STEP {
-                let correlation = gain * (self.energy / energy).sqrt();
-                return self.judge(at, &seen, &gradient, &step, correlation);
-            }
-            at -= step.xy().map(|v| v as f32);
-        }
-        None
+        align(self, image, start, reach)
     }
 
     /// What an alignment came to that left `misfit`, whose products with the derivatives are
@@ -258,7 +220,87 @@ impl Template {
     }
 }
 
+widened! {
+    fn template = template_in, (image: &GrayImage, centre: &Vector2<f32>, warp: &Warp, surface: &Surface) -> Option<Template>
+}
+
+widened! {
+    fn align = align_in, (template: &Template, image: &GrayImage, start: &Vector2<f32>, reach: f32) -> Option<Aligned>
+}
+
+#[inline(always)]
+fn template_in(
+    image: &GrayImage,
+    centre: &Vector2<f32>,
+    warp: &Warp,
+    surface: &Surface,
+) -> Option<Template> {
+    let reach = (HALF + 1) as f32;
+    let nearest = 1.0 - reach * warp.depth.abs().sum();
+    if nearest < 0.5 {
+        return None;
+    }
+    let linear = &warp.linear;
+    let extent = Vector2::new(
+        linear[(0, 0)].abs() + linear[(0, 1)].abs(),
+        linear[(1, 0)].abs() + linear[(1, 1)].abs(),
+    ) * (reach / nearest);
+    if !holds(image, centre, &extent) {
+        return None;
+    }
+    let (mut x, mut y) = ([0.0; RIM_AREA], [0.0; RIM_AREA]);
+    for row in 0..RIM_SIDE {
+        let v = row as f32 - reach;
+        for column in 0..RIM_SIDE {
+            let u = column as f32 - reach;
+            let nearness = 1.0 - (warp.depth.x * u + warp.depth.y * v);
+            let i = row * RIM_SIDE + column;
+            x[i] = centre.x + (linear[(0, 0)] * u + linear[(0, 1)] * v) / nearness;
+            y[i] = centre.y + (linear[(1, 0)] * u + linear[(1, 1)] * v) / nearness;
+        }
+    }
+    Template::from_samples(&sample(image, &x, &y), surface)
+}
+
+#[inline(always)]
+fn align_in(
+    template: &Template,
+    image: &GrayImage,
+    start: &Vector2<f32>,
+    reach: f32,
+) -> Option<Aligned> {
+    let inverse = (template.normal + template.known.0 * USUAL_VARIANCE)
+        .cholesky()?
+        .inverse();
+    let mut at = *start;
+    let mut seen = [0.0; ROOM];
+    for _ in 0..MAX_ITERATIONS {
+        if !holds(image, &at, &Vector2::repeat(MARGIN)) || (at - start).amax() > reach {
+            return None;
+        }
+        sample_square(image, &at, &mut seen);
+        centre_on_zero(&mut seen);
+        let gain = dot(&seen, &template.values) / template.energy;
+        if gain <= 0.1 {
+            return None;
+        }
+        let energy = dot(&seen, &seen);
+        for (s, v) in seen.iter_mut().zip(&template.values) {
+            *s = *s / gain - v;
+        }
+        let gradient = Vector4::from(template.by.each_ref().map(|by| f64::from(dot(by, &seen))));
+        let step = inverse * (gradient + template.known.1 * USUAL_VARIANCE);
+        if step.xy().amax() < MIN_STEP {
+            let correlation = gain * (template.energy / energy).sqrt();
+            return template.judge(at, &seen, &gradient, &step, correlation);
+        }
+        at -= step.xy().map(|v| v as f32);
+    }
+    None
+}
+
 /// Whether all within `extent` of a position can be interpolated.
+#[inline(always)]
 fn holds(image: &GrayImage, at: &Vector2<f32>, extent: &Vector2<f32>) -> bool {
     at.x - extent.x >= 0.0
         && at.y - extent.y >= 0.0
@@ -266,17 +308,31 @@ fn holds(image: &GrayImage, at: &Vector2<f32>, extent: &Vector2<f32>) -> bool {
         && at.y + extent.y < image.height() as f32 - 1.0
 }
 
-/// Bilinear interpolation.
-fn sample(image: &GrayImage, at: &Vector2<f32>) -> f32 {
-    let (x, y) = (at.x as u32, at.y as u32);
-    let (fx, fy) = (at.x - x as f32, at.y - y as f32);
-    let (top, bottom) = (&image.row(y)[x as usize..], &image.row(y + 1)[x as usize..]);
-    let upper = f32::from(top[0]) * (1.0 - fx) + f32::from(top[1]) * fx;
-    let lower = f32::from(bottom[0]) * (1.0 - fx) + f32::from(bottom[1]) * fx;
-    upper * (1.0 - fy) + lower * fy
+/// Bilinear interpolation at many places, all inside the image.
+#[inline(always)]
+fn sample(image: &GrayImage, x: &[f32; RIM_AREA], y: &[f32; RIM_AREA]) -> [f32; RIM_AREA] {
+    let (width, pixels) = (image.width() as usize, image.pixels());
+    // Pixels lie anywhere, arithmetic can be done side by side.
+    let mut corners = [[0_u8; RIM_AREA]; 4];
+    for i in 0..RIM_AREA {
+        let first = y[i] as u32 as usize * width + x[i] as u32 as usize;
+        [corners[0][i], corners[1][i]] = [pixels[first], pixels[first + 1]];
+        [corners[2][i], corners[3][i]] = [pixels[first + width], pixels[first + width + 1]];
+    }
+    let mut samples = [0.0; RIM_AREA];
+    for i in 0..RIM_AREA {
+        let (fx, fy) = (x[i] - x[i].trunc(), y[i] - y[i].trunc());
+        let corner = |n: usize| f32::from(corners[n][i]);
+        let upper = corner(0) * (1.0 - fx) + corner(1) * fx;
+        let lower = corner(2) * (1.0 - fx) + corner(3) * fx;
+        samples[i] = upper * (1.0 - fy) + lower * fy;
+    }
+    samples
 }
 
-/// The square of pixels around `at`, bilinear: all share their weights.
+/// The square of pixels around `at`, bilinear: all share their weights. What lies behind the last
+/// sample is zero afterwards.
+#[inline(always)]
 fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut Samples) {
     let (x, y) = (at.x.floor(), at.y.floor());
     let (fx, fy) = (at.x - x, at.y - y);
@@ -287,19 +343,31 @@ fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut Samples) {
         fx * fy,
     ];
     let (left, top) = (x as usize - HALF, y as u32 - HALF as u32);
-    let mut above = &image.row(top)[left..][..SIDE + 1];
-    for (row, out) in (1..).zip(out[..AREA].chunks_exact_mut(SIDE)) {
-        let below = &image.row(top + row)[left..][..SIDE + 1];
-        for (i, o) in out.iter_mut().enumerate() {
-            *o = weights[0] * f32::from(above[i])
-                + weights[1] * f32::from(above[i + 1])
-                + weights[2] * f32::from(below[i])
-                + weights[3] * f32::from(below[i + 1]);
+    let mut above = greys(image, left, top);
+    for row in 0..SIDE {
+        let below = greys(image, left, top + 1 + row as u32);
+        // Whole registers: what is too much, the next row writes over.
+        let out = &mut out[row * SIDE..][..WIDE_SIDE];
+        for i in 0..WIDE_SIDE {
+            out[i] = weights[0] * above[i]
+                + weights[1] * above[i + 1]
+                + weights[2] * below[i]
+                + weights[3] * below[i + 1];
         }
         above = below;
     }
+    out[AREA..].fill(0.0);
 }
 
+/// The grey values of a row that a row of samples lies between, and zeros.
+#[inline(always)]
+fn greys(image: &GrayImage, left: usize, row: u32) -> [f32; WIDE_SIDE + 1] {
+    let mut bytes = [0; WIDE_SIDE + 1];
+    bytes[..=SIDE].copy_from_slice(&image.row(row)[left..][..=SIDE]);
+    bytes.map(f32::from)
+}
+
+#[inline(always)]
 fn centre_on_zero(values: &mut Samples) {
     let mut sums = [0.0; LANES];
     for values in values.as_chunks::<LANES>().0 {
@@ -313,6 +381,7 @@ fn centre_on_zero(values: &mut Samples) {
     }
 }
 
+#[inline(always)]
 fn dot(a: &Samples, b: &Samples) -> f32 {
     let mut sums = [0.0; LANES];
     let (a, b) = (a.as_chunks::<LANES>().0, b.as_chunks::<LANES>().0);

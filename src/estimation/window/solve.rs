@@ -39,9 +39,12 @@ pub(super) struct State {
 const MAX_DAMPING: f64 = 1e3;
 /// Iterations of Levenberg and Marquardt at most.
 const MAX_ITERATIONS: usize = 12;
-/// The gain in cost, σ², that a step must promise to be worth taking: a hundredth of the σ of any
-/// pose.
-const MIN_GAIN: f64 = 1e-4;
+/// The gain in cost, σ², of a step that may be the last: at most a tenth of the σ of any pose. What would
+/// follow is a small part of it.
+const LAST_GAIN: f64 = 5e-3;
+/// Steps before the newest frame's sights are judged for the first time: while wrong ones pull, steps are
+/// many and small.
+const ROUGH_STEPS: usize = 1;
 /// The largest squared residual that counts, over the median one: beyond it lie 0.2 % of Gaussian
 /// ones (χ² with four degrees of freedom: 16.9 over 3.36).
 const LARGEST_OVER_MEDIAN: f64 = 5.0;
@@ -197,6 +200,8 @@ impl Window {
     }
 
     fn adjust_and_judge(&mut self) -> Option<Tracked> {
+        self.approach();
+        self.judge_newest();
         let mut joint = self.solve()?;
         for _ in 1..ROUNDS {
             if self.judge_newest() == 0 {
@@ -244,28 +249,51 @@ impl Window {
         }
     }
 
+    /// Goes the first steps of an adjustment.
+    fn approach(&mut self) {
+        self.with_working_memory(|window, system, memory| {
+            if let Some(factor) = window.iterate(system, memory, ROUGH_STEPS) {
+                memory.recycle(factor.unpack_dirty());
+            }
+        });
+    }
+
     /// Adjusts warp, poses and landmarks; the joint covariance of warp and poses at the optimum.
     fn solve(&mut self) -> Option<Joint> {
-        let mut system = std::mem::take(&mut self.system);
-        let mut memory = std::mem::take(&mut self.memory);
-        let joint = self.iterate(&mut system, &mut memory).map(|factor| {
+        self.with_working_memory(|window, system, memory| {
+            let factor = window.iterate(system, memory, MAX_ITERATIONS)?;
             let mut joint = memory.square(factor.l_dirty().nrows());
             joint.fill_with_identity();
             factor.solve_mut(&mut joint);
             memory.recycle(factor.unpack_dirty());
-            joint
-        });
-        self.system = system;
-        self.memory = memory;
-        joint
+            Some(joint)
+        })
     }
 
-    /// Levenberg–Marquardt; the last equations' information, factored.
-    fn iterate(&mut self, system: &mut System, memory: &mut Memory) -> Option<Cholesky<f64, Dyn>> {
+    /// Lends the working memory of an adjustment, which belongs to the window.
+    fn with_working_memory<T>(
+        &mut self,
+        work: impl FnOnce(&mut Self, &mut System, &mut Memory) -> T,
+    ) -> T {
+        let mut system = std::mem::take(&mut self.system);
+        let mut memory = std::mem::take(&mut self.memory);
+        let outcome = work(self, &mut system, &mut memory);
+        self.system = system;
+        self.memory = memory;
+        outcome
+    }
+
+    /// Levenberg–Marquardt, `most` iterations at most; the last equations' information, factored.
+    fn iterate(
+        &mut self,
+        system: &mut System,
+        memory: &mut Memory,
+        most: usize,
+    ) -> Option<Cholesky<f64, Dyn>> {
         let mut damping = 0.0;
         let mut has_kept = false;
         let mut factor: Option<Cholesky<f64, Dyn>> = None;
-        for _ in 0..MAX_ITERATIONS {
+        for _ in 0..most {
             let (mut hessian, gradient, cost) = self.equations(system, memory, damping);
             if has_kept && cost > self.kept.cost + 1e-9 * self.kept.cost.abs() {
                 has_kept = false;
@@ -298,16 +326,11 @@ impl Window {
             if let Some(before) = factor.replace(cholesky) {
                 memory.recycle(before.unpack_dirty());
             }
-            let is_done = damping == 0.0 && gain < MIN_GAIN;
-            if is_done {
-                // The landmarks' own covariances are still due.
-                step.fill(0.0);
-            } else {
-                self.keep(cost);
-                has_kept = true;
-                self.move_frames(&step);
-                damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
-            }
+            let is_done = damping == 0.0 && gain < LAST_GAIN;
+            self.keep(cost);
+            has_kept = true;
+            self.move_frames(&step);
+            damping = if damping > 1e-5 { damping * 0.1 } else { 0.0 };
             system.move_landmarks(&step, &mut self.landmarks);
             memory.recycle_vector(step);
             if is_done {

@@ -13,6 +13,7 @@ use crate::geometry::product::{
     product, subtract_product_transposed, transposed_product, transposed_scaled,
 };
 use crate::geometry::{StereoRig, se3};
+use crate::simd::widened;
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, SVector, Vector2, Vector4, Vector6};
 
 /// Where and how observations are linearised.
@@ -110,7 +111,7 @@ impl System {
         self.begin(at.frames);
         let mut cost = 0.0;
         for (index, landmark) in landmarks {
-            cost += self.eliminate(at, index, landmark).unwrap_or(0.0);
+            cost += eliminate(self, at, index, landmark).unwrap_or(0.0);
         }
         self.expand_sightlines();
         cost / at.variance_factor
@@ -175,122 +176,6 @@ impl System {
         self.warp_gradient = SVector::zeros();
         self.reduced.clear();
         self.crosses.clear();
-    }
-
-    /// Adds a landmark's observations and eliminates its point. `None` if it has fewer than two or
-    /// cannot be seen from where it was observed.
-    fn eliminate(&mut self, at: &At<'_>, index: usize, landmark: &Landmark) -> Option<f64> {
-        let (rig, warp, frames) = (at.rig, at.warp, at.frames);
-        let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
-        let mut point_point = SMatrix::<f64, POINT, POINT>::zeros();
-        let mut point_gradient = SVector::<f64, POINT>::zeros();
-        let mut warp_point = SMatrix::<f64, WARP, POINT>::zeros();
-        let mut warp_warp = SMatrix::<f64, WARP, WARP>::zeros();
-        let mut warp_gradient = SVector::<f64, WARP>::zeros();
-        let mut cost = 0.0;
-        let first_cross = self.crosses.len();
-        let mut anchor_by_point = SMatrix::<f64, 6, POINT>::zeros();
-        let mut sights = 0;
-        for observation in &landmark.observations {
-            if Some(observation.serial) == at.without {
-                continue;
-            }
-            let Some(frame) = frames.iter().position(|f| f.serial == observation.serial) else {
-                continue;
-            };
-            let line = &mut self.sightlines[anchor * self.frame_count + frame];
-            let from = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
-            let Some(mut seen) = sight::linearise(rig, from, &landmark.inverse_depth) else {
-                continue;
-            };
-            if line.linearised.is_some() {
-                let Some(px) =
-                    sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
-                else {
-                    continue;
-                };
-                seen.px = px;
-            }
-            sights += 1;
-            let (info, residual, loss) = weigh(
-                &(warp.corrected(&observation.measurement).px
-                    - seen.px
-                    - observation.by_relief(&landmark.relief)),
-                &observation.measurement.sigma_px,
-                at.variance_factor,
-            );
-            cost += loss;
-            let seen_by_point = by_point(&seen, observation);
-            let weighted = transposed_scaled(&seen_by_point, &info);
-            point_point += product(&weighted, &seen_by_point);
-            point_gradient += product(&weighted, &residual);
-            let by_warp = warp.derivative(&observation.measurement);
-            let warp_weighted = transposed_scaled(&by_warp, &Vector2::new(info[2], info[3]));
-            warp_warp += product(&warp_weighted, &by_warp);
-            let right_by_point = seen_by_point.fixed_rows::<2>(2).into_owned();
-            warp_point += product(&warp_weighted, &right_by_point);
-            warp_gradient += product(&warp_weighted, &Vector2::new(residual[2], residual[3]));
-            if frame == anchor {
-                continue;
-            }
-            let weighted = transposed_scaled(&seen.by_motion, &info);
-            line.information += product(&weighted, &seen.by_motion);
-            let of_right = weighted.fixed_columns::<2>(2).into_owned();
-            line.by_warp += product(&of_right, &by_warp);
-            line.gradient += product(&weighted, &residual);
-            line.is_used = true;
-            let by_point = product(&weighted, &seen_by_point);
-            anchor_by_point -= product(&line.adjoint_transposed, &by_point);
-            self.crosses.push(Cross { frame, by_point });
-        }
-        if sights < 2 {
-            self.crosses.truncate(first_cross);
-            return None;
-        }
-        self.crosses.push(Cross {
-            frame: anchor,
-            by_point: anchor_by_point,
-        });
-        // The relief has σ 1, which like all σ is to be scaled.
-        for i in 0..2 {
-            point_point[(3 + i, 3 + i)] += 1.0 / at.variance_factor;
-            point_gradient[3 + i] -= landmark.relief[i] / at.variance_factor;
-        }
-        cost += 0.5 * landmark.relief.norm_squared();
-        for i in 0..POINT {
-            point_point[(i, i)] *= 1.0 + at.damping;
-        }
-        let cov = point_point.cholesky()?.inverse();
-        let crosses = first_cross..self.crosses.len();
-        for i in crosses.clone() {
-            let a = &self.crosses[i];
-            // The datum has no unknowns.
-            if a.frame == 0 {
-                continue;
-            }
-            let gain = product(&a.by_point, &cov);
-            self.gradients[a.frame] -= product(&gain, &point_gradient);
-            subtract_product_transposed(&mut self.by_warp[a.frame], &gain, &warp_point);
-            let row = &mut self.blocks[a.frame * self.frame_count..][..self.frame_count];
-            for b in &self.crosses[crosses.clone()] {
-                if a.frame <= b.frame {
-                    subtract_product_transposed(&mut row[b.frame], &gain, &b.by_point);
-                }
-            }
-        }
-        let gain = product(&warp_point, &cov);
-        subtract_product_transposed(&mut warp_warp, &gain, &warp_point);
-        self.warp_warp += warp_warp;
-        self.warp_gradient += warp_gradient - product(&gain, &point_gradient);
-        self.reduced.push(Reduced {
-            landmark: index,
-            crosses,
-            cov,
-            gradient: point_gradient,
-            settled: 5.0 - (cov[(3, 3)] + cov[(4, 4)]) / at.variance_factor,
-            by_warp: warp_point,
-        });
-        Some(cost)
     }
 
     /// Hands on what the sightlines gathered to the poses at their two ends.
@@ -375,6 +260,134 @@ impl System {
             landmark.cov = r.cov.fixed_view::<3, 3>(0, 0).into_owned();
         }
     }
+}
+
+widened! {
+    fn eliminate = eliminate_in, (system: &mut System, at: &At<'_>, index: usize, landmark: &Landmark) -> Option<f64>
+}
+
+/// Adds a landmark's observations and eliminates its point. `None` if it has fewer than two or
+/// cannot be seen from where it was observed.
+#[inline(always)]
+fn eliminate_in(
+    system: &mut System,
+    at: &At<'_>,
+    index: usize,
+    landmark: &Landmark,
+) -> Option<f64> {
+    if landmark.observations.len() < 2 {
+        return None;
+    }
+    let (rig, warp, frames) = (at.rig, at.warp, at.frames);
+    let anchor = frames.iter().position(|f| f.serial == landmark.anchor)?;
+    let mut point_point = SMatrix::<f64, POINT, POINT>::zeros();
+    let mut point_gradient = SVector::<f64, POINT>::zeros();
+    let mut warp_point = SMatrix::<f64, WARP, POINT>::zeros();
+    let mut warp_warp = SMatrix::<f64, WARP, WARP>::zeros();
+    let mut warp_gradient = SVector::<f64, WARP>::zeros();
+    let mut cost = 0.0;
+    let first_cross = system.crosses.len();
+    let mut anchor_by_point = SMatrix::<f64, 6, POINT>::zeros();
+    let mut sights = 0;
+    for observation in &landmark.observations {
+        if Some(observation.serial) == at.without {
+            continue;
+        }
+        let Some(frame) = frames.iter().position(|f| f.serial == observation.serial) else {
+            continue;
+        };
+        let line = &mut system.sightlines[anchor * system.frame_count + frame];
+        let from = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
+        let Some(mut seen) = sight::linearise(rig, from, &landmark.inverse_depth) else {
+            continue;
+        };
+        if line.linearised.is_some() {
+            let Some(px) = sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
+            else {
+                continue;
+            };
+            seen.px = px;
+        }
+        sights += 1;
+        let (info, residual, loss) = weigh(
+            &(warp.corrected(&observation.measurement).px
+                - seen.px
+                - observation.by_relief(&landmark.relief)),
+            &observation.measurement.sigma_px,
+            at.variance_factor,
+        );
+        cost += loss;
+        let seen_by_point = by_point(&seen, observation);
+        let weighted = transposed_scaled(&seen_by_point, &info);
+        point_point += product(&weighted, &seen_by_point);
+        point_gradient += product(&weighted, &residual);
+        let by_warp = warp.derivative(&observation.measurement);
+        let warp_weighted = transposed_scaled(&by_warp, &Vector2::new(info[2], info[3]));
+        warp_warp += product(&warp_weighted, &by_warp);
+        let right_by_point = seen_by_point.fixed_rows::<2>(2).into_owned();
+        warp_point += product(&warp_weighted, &right_by_point);
+        warp_gradient += product(&warp_weighted, &Vector2::new(residual[2], residual[3]));
+        if frame == anchor {
+            continue;
+        }
+        let weighted = transposed_scaled(&seen.by_motion, &info);
+        line.information += product(&weighted, &seen.by_motion);
+        let of_right = weighted.fixed_columns::<2>(2).into_owned();
+        line.by_warp += product(&of_right, &by_warp);
+        line.gradient += product(&weighted, &residual);
+        line.is_used = true;
+        let by_point = product(&weighted, &seen_by_point);
+        anchor_by_point -= product(&line.adjoint_transposed, &by_point);
+        system.crosses.push(Cross { frame, by_point });
+    }
+    if sights < 2 {
+        system.crosses.truncate(first_cross);
+        return None;
+    }
+    system.crosses.push(Cross {
+        frame: anchor,
+        by_point: anchor_by_point,
+    });
+    // The relief has σ 1, which like all σ is to be scaled.
+    for i in 0..2 {
+        point_point[(3 + i, 3 + i)] += 1.0 / at.variance_factor;
+        point_gradient[3 + i] -= landmark.relief[i] / at.variance_factor;
+    }
+    cost += 0.5 * landmark.relief.norm_squared();
+    for i in 0..POINT {
+        point_point[(i, i)] *= 1.0 + at.damping;
+    }
+    let cov = point_point.cholesky()?.inverse();
+    let crosses = first_cross..system.crosses.len();
+    for i in crosses.clone() {
+        let a = &system.crosses[i];
+        // The datum has no unknowns.
+        if a.frame == 0 {
+            continue;
+        }
+        let gain = product(&a.by_point, &cov);
+        system.gradients[a.frame] -= product(&gain, &point_gradient);
+        subtract_product_transposed(&mut system.by_warp[a.frame], &gain, &warp_point);
+        let row = &mut system.blocks[a.frame * system.frame_count..][..system.frame_count];
+        for b in &system.crosses[crosses.clone()] {
+            if a.frame <= b.frame {
+                subtract_product_transposed(&mut row[b.frame], &gain, &b.by_point);
+            }
+        }
+    }
+    let gain = product(&warp_point, &cov);
+    subtract_product_transposed(&mut warp_warp, &gain, &warp_point);
+    system.warp_warp += warp_warp;
+    system.warp_gradient += warp_gradient - product(&gain, &point_gradient);
+    system.reduced.push(Reduced {
+        landmark: index,
+        crosses,
+        cov,
+        gradient: point_gradient,
+        settled: 5.0 - (cov[(3, 3)] + cov[(4, 4)]) / at.variance_factor,
+        by_warp: warp_point,
+    });
+    Some(cost)
 }
 
 /// The derivative of a sight by the unknowns of its landmark.
