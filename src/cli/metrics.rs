@@ -6,7 +6,7 @@
 use super::Failure;
 use crate::capture::live::{Monitor, Snapshot, State};
 use crate::config::Config;
-use crate::pipeline::{self, Delivery, RunCounts, StageLatencies};
+use crate::pipeline::{self, Delivery, RunCounts, StageLatencies, Undelivered};
 use crate::service::metrics::Exposition;
 use prometheus_client::collector::Collector;
 use prometheus_client::encoding::{
@@ -34,8 +34,8 @@ pub(crate) struct Totals {
     pub(crate) counts: RunCounts,
     /// Messages of `visod/odometry` published.
     pub(crate) published: u64,
-    /// Messages that could not be.
-    pub(crate) publish_failures: u64,
+    /// What could not be handed on.
+    pub(crate) undelivered: Undelivered,
     /// Subscribers of `visod/odometry`.
     pub(crate) subscribers: usize,
     /// Rows that came after the deadline.
@@ -146,7 +146,7 @@ impl Page<'_> {
             "Rows of odometry by status",
             by_status.map(|(status, n)| ([("status", status)], n)),
         )?;
-        let drops = pipeline::drops(Some(cameras), counts, totals.publish_failures);
+        let drops = pipeline::drops(Some(cameras), counts, &totals.undelivered);
         self.counters(
             "drops",
             "What was lost by stage and reason: frames of one camera, else pairs or messages",

@@ -24,7 +24,7 @@ use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
 use crate::pipeline::{
-    self, Delivery, DropCount, Fault, Method, RunCounts, RunFigures, Share, Statistics,
+    self, Delivery, DropCount, Fault, Method, RunCounts, RunFigures, Share, Statistics, Undelivered,
 };
 use crate::rig_watch::RigState;
 use crate::service::budget::{FrameBudget, Timing};
@@ -294,6 +294,7 @@ impl Session {
         })
         .map_err(Failure::other)?;
         bar.finish_and_clear();
+        let undelivered = self.undelivered();
         if let Some((file, csv)) = self.csv {
             csv.finish().map_err(|e| unwritable(&file, &e))?;
         }
@@ -302,7 +303,7 @@ impl Session {
         }
         #[cfg(feature = "mcap")]
         if let Some((file, mcap)) = self.mcap {
-            let left_out = mcap.left_out();
+            let left_out = undelivered.unrecorded;
             mcap.finish().map_err(|e| unwritable(&file, &e))?;
             if left_out > 0 {
                 eprintln!(
@@ -313,7 +314,8 @@ impl Session {
         }
         #[cfg(feature = "foxglove")]
         if let Some(server) = self.foxglove {
-            let left_out = server.left_out();
+            drop(server);
+            let left_out = undelivered.unshown;
             if left_out > 0 {
                 eprintln!(
                     "visod: warning: foxglove: {left_out} pairs were not shown, as there was no time to"
@@ -329,7 +331,7 @@ impl Session {
         let mut figures = statistics.figures();
         figures.counts.dropped = cameras.as_ref().map_or(0, |c| c.dropped);
         Ok(Finished {
-            drops: pipeline::drops(cameras.as_ref(), &figures.counts, self.publish_failures),
+            drops: pipeline::drops(cameras.as_ref(), &figures.counts, &undelivered),
             figures,
             cameras,
             rows: self.rows.unwrap_or_default(),
@@ -431,6 +433,23 @@ impl Session {
         Ok(row)
     }
 
+    /// What could not be handed on until now.
+    fn undelivered(&self) -> Undelivered {
+        #[cfg(feature = "mcap")]
+        let unrecorded = self.mcap.as_ref().map_or(0, |(_, mcap)| mcap.left_out());
+        #[cfg(not(feature = "mcap"))]
+        let unrecorded = 0;
+        #[cfg(feature = "foxglove")]
+        let unshown = self.foxglove.as_ref().map_or(0, FoxgloveServer::left_out);
+        #[cfg(not(feature = "foxglove"))]
+        let unshown = 0;
+        Undelivered {
+            unpublished: self.publish_failures,
+            unrecorded,
+            unshown,
+        }
+    }
+
     /// Leaves the totals up to a row to those who fetch figures.
     fn leave_figures(&self, delivery: &Delivery<'_>, counts: &RunCounts) {
         let (Some((metrics, _)), Some(live)) = (&self.metrics, &self.live) else {
@@ -443,7 +462,7 @@ impl Session {
         let totals = Totals {
             counts: *counts,
             published: self.published,
-            publish_failures: self.publish_failures,
+            undelivered: self.undelivered(),
             subscribers,
             overruns: live.budget.overruns(),
             over_period: live.budget.over_period(),

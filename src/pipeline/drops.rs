@@ -7,7 +7,7 @@ use serde::Serialize;
 /// What one stage lost for one reason.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
 pub struct DropCount {
-    /// Where: `capture`, `pairing`, `queue`, `features`, `matching` or `publication`.
+    /// Where: `capture`, `pairing`, `queue`, `features`, `matching`, `publication`, `recording` or `view`.
     pub stage: &'static str,
     /// Why, in a word.
     pub reason: &'static str,
@@ -17,13 +17,28 @@ pub struct DropCount {
     pub count: u64,
 }
 
+/// What did not reach those for whom it was meant, though it was there.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Undelivered {
+    /// Messages that could not be published.
+    pub unpublished: u64,
+    /// Pairs whose images are not in the recording of this run, the disk being behind.
+    pub unrecorded: u64,
+    /// Pairs that a live view did not show, there being no time to.
+    pub unshown: u64,
+}
+
 /// All that a run may lose, with what it has lost: of frames where there are cameras, of pairs, and of
 /// messages. A reason that has not occurred counts 0.
 ///
 /// A left frame without a partner also costs its pair, whose row is then bridged; that is told by the rows'
 /// status and not counted here a second time.
 #[must_use]
-pub fn drops(cameras: Option<&Snapshot>, counts: &RunCounts, unpublished: u64) -> Vec<DropCount> {
+pub fn drops(
+    cameras: Option<&Snapshot>,
+    counts: &RunCounts,
+    undelivered: &Undelivered,
+) -> Vec<DropCount> {
     let both = |stage, reason, count| DropCount {
         stage,
         reason,
@@ -39,7 +54,9 @@ pub fn drops(cameras: Option<&Snapshot>, counts: &RunCounts, unpublished: u64) -
         both("queue", "stages_late", dropped),
         both("features", "failed", counts.unusable_in_features),
         both("matching", "failed", counts.unusable_in_matching),
-        both("publication", "failed", unpublished),
+        both("publication", "failed", undelivered.unpublished),
+        both("recording", "disk_behind", undelivered.unrecorded),
+        both("view", "no_time", undelivered.unshown),
     ]);
     drops
 }
@@ -86,14 +103,21 @@ mod tests {
             unusable_in_matching: 6,
             ..RunCounts::default()
         };
-        let drops = drops(Some(&cameras), &counts, 7);
+        let undelivered = Undelivered {
+            unpublished: 7,
+            unrecorded: 8,
+            unshown: 10,
+        };
+        let drops = drops(Some(&cameras), &counts, &undelivered);
         assert_eq!(count(&drops, "capture", "incomplete", "left"), Some(3));
         assert_eq!(count(&drops, "pairing", "other_silent", "right"), Some(1));
         assert_eq!(count(&drops, "queue", "stages_late", "both"), Some(5));
         assert_eq!(count(&drops, "features", "failed", "both"), Some(1));
         assert_eq!(count(&drops, "matching", "failed", "both"), Some(6));
         assert_eq!(count(&drops, "publication", "failed", "both"), Some(7));
-        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 23);
+        assert_eq!(count(&drops, "recording", "disk_behind", "both"), Some(8));
+        assert_eq!(count(&drops, "view", "no_time", "both"), Some(10));
+        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 41);
     }
 
     #[test]
@@ -102,7 +126,7 @@ mod tests {
             unusable_in_capture: 4,
             ..RunCounts::default()
         };
-        let drops = drops(None, &counts, 0);
+        let drops = drops(None, &counts, &Undelivered::default());
         assert_eq!(count(&drops, "capture", "unusable", "both"), Some(4));
         assert!(drops.iter().all(|d| d.camera == "both"));
     }

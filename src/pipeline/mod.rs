@@ -14,7 +14,7 @@ mod two_frame;
 mod windowed;
 
 pub use driver::{Delivery, Fault, PipelineError, Settings, Stage, StageLatencies, run};
-pub use drops::{DropCount, drops};
+pub use drops::{DropCount, Undelivered, drops};
 pub use method::{Described, DescribedPair, Method, StageTimes};
 pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};
 pub use trim::Share;

@@ -6,11 +6,6 @@
 //! surface's slope is estimated along with the translation, by what is known of it before; a
 //! translation that stands for a slope would be off.
 
-#![expect(
-    clippy::needless_range_loop,
-    reason = "several arrays run along one index, plainly enough to be computed by whole registers"
-)]
-
 use crate::image::GrayImage;
 use crate::simd::widened;
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};

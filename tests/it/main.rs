@@ -55,6 +55,8 @@ mod report;
 #[cfg(test)]
 mod samples;
 #[cfg(test)]
+mod scenarios;
+#[cfg(test)]
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod service;
 #[cfg(test)]

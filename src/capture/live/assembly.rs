@@ -11,6 +11,7 @@ use crate::capture::settings::Settings;
 use crate::capture::{PairEvent, Side, StereoPair, Unusable};
 use crate::image::GrayImage;
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 /// Without a pair for this long, the stages are told so.
@@ -64,7 +65,7 @@ impl Assembly {
             spares: Spares::new(sources.map(|source| source.size_px())),
             journal: Journal::new(delivery.keeps_journal),
             cameras: sources.map(|source| CameraStatus {
-                identity: source.identity(),
+                identity: source.identity().into(),
                 ..CameraStatus::default()
             }),
             captured: VecDeque::with_capacity(TIMES_KEPT + 1),
@@ -90,7 +91,7 @@ impl Assembly {
         let status = &mut self.cameras[side as usize];
         status.reconnects += 1;
         status.state = State::Opening;
-        status.cause.clear();
+        status.cause = Arc::default();
     }
 
     /// Frames of a camera did not arrive, or not in one piece.
@@ -104,7 +105,7 @@ impl Assembly {
         let status = &mut self.cameras[side as usize];
         let taken = self.times.of(side, &frame, status);
         status.state = State::Streaming;
-        status.cause.clear();
+        status.cause = Arc::default();
         status.frames += 1;
         status.last_arrived_ns = frame.arrived_ns;
         let candidate = Candidate {

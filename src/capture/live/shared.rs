@@ -93,9 +93,11 @@ impl Shared {
         let camera = name_of(side);
         let mut assembly = self.lock();
         let status = &mut assembly.cameras[side as usize];
-        let is_new = status.state != state || status.cause != cause;
+        let is_new = status.state != state || *status.cause != *cause;
         status.state = state;
-        cause.clone_into(&mut status.cause);
+        if is_new {
+            status.cause = cause.into();
+        }
         drop(assembly);
         if is_new {
             let state = state.as_str();

@@ -3,6 +3,7 @@
 use crate::capture::camera::Losses;
 use crate::capture::clock::ClockEstimate;
 use crate::capture::pairing::Unmatched;
+use std::sync::Arc;
 
 /// What a camera is doing.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -34,12 +35,12 @@ impl State {
 /// What is known about one camera. Counters never fall.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct CameraStatus {
-    /// Which camera it is.
-    pub identity: String,
+    /// Which camera it is. Shared, as `cause` is, so that a snapshot allocates nothing.
+    pub identity: Arc<str>,
     /// What it is doing.
     pub state: State,
     /// Why, where it is not streaming.
-    pub cause: String,
+    pub cause: Arc<str>,
     /// Frames received.
     pub frames: u64,
     /// Times that it was opened anew.
