@@ -5,7 +5,7 @@ use super::*;
 use crate::simulation::{self, points};
 use crate::uncertainty::consistency;
 use nalgebra::{Vector2, Vector4, Vector6};
-use rand::SeedableRng;
+use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use std::collections::HashMap;
@@ -309,5 +309,81 @@ fn what_cannot_be_adjusted_leaves_the_window_as_it_was() {
         window
             .consent(&[], &[], &step(), 1, &mut Vec::new())
             .is_none()
+    );
+}
+
+/// Depths, m: all far, all near, all on a plane, a few hundred metres, or the usual.
+const DEPTHS_M: [[f64; 2]; 5] = [
+    [800.0, 5000.0],
+    [0.8, 1.5],
+    [8.0, 8.001],
+    [100.0, 400.0],
+    [2.0, 40.0],
+];
+
+/// Few landmarks, which need not determine anything, seen by a robot that stands, drives or turns.
+#[test]
+fn every_covariance_is_one_under_ten_thousand_configurations() {
+    let rig = simulation::thesis_rig();
+    let (mut given, mut refused) = (0, 0);
+    for seed in 0..400 {
+        let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
+        let world = points::Settings {
+            landmarks: rng.random_range(6..30),
+            depth_m: DEPTHS_M[seed as usize % DEPTHS_M.len()],
+            survival: rng.random_range(0.3..1.0),
+            ..points::Settings::default()
+        };
+        let mut simulation = points::PointSimulation::new(rig.clone(), world, seed).expect("valid");
+        let mut frame = points::PointFrame::default();
+        let settings = Settings {
+            min_inliers: 3,
+            ..Settings::default()
+        };
+        let mut window = Window::new(rig.clone(), settings);
+        let mut truth = Isometry3::identity();
+        let mut relief = Relief::new(0.0, false, seed);
+        let mut begins = true;
+        for _ in 0..25 {
+            let step = match rng.random_range(0..3) {
+                0 => Isometry3::identity(),
+                1 => step(),
+                _ => se3::exp(&Vector6::new(0.0, 0.0, 0.05, 0.02, 0.2, -0.05)),
+            };
+            truth *= step;
+            simulation.observe(&truth, &mut frame);
+            let seen = sights(&frame, 0.0, &mut relief);
+            if begins {
+                window.begin_at(&truth, &(Matrix6::identity() * 1e-12), &BySources::zeros());
+                window.promote(&seen);
+                begins = false;
+                continue;
+            }
+            let (known, new): (Vec<Seen>, Vec<Seen>) =
+                seen.iter().partition(|s| window.landmark(s.id).is_some());
+            window.add(&step, &known);
+            let Some(tracked) = window.adjust() else {
+                refused += 1;
+                begins = true;
+                continue;
+            };
+            given += 1;
+            for (what, cov) in [
+                ("pose", tracked.cov_pose_right),
+                ("motion", tracked.motion.cov_right),
+            ] {
+                let is_one = consistency::nees(&Vector6::repeat(1e-3), &cov).is_some();
+                assert!(is_one, "{what}, run {seed}: {cov}");
+            }
+            window.settle();
+            if rng.random_bool(0.7) {
+                window.promote(&new);
+            }
+        }
+    }
+    println!("{given} given, {refused} refused");
+    assert!(
+        given + refused > 9_000 && given > 5_000,
+        "{given}, {refused}"
     );
 }
