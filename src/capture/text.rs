@@ -35,11 +35,45 @@ pub(super) fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
         .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
 }
 
-/// The stamps of a file with one time in seconds a line, ns, strictly rising.
-pub(super) fn times_ns(file: &Path) -> Result<Vec<i64>, DatasetError> {
+/// The stamps of a recording.
+pub(super) struct Times {
+    /// When each pair was taken, ns, strictly rising.
+    pub(super) ns: Vec<i64>,
+    /// Whether all are written as visod's recorder writes them, to the nanosecond. Such a file may have been
+    /// cut off together with its images.
+    pub(super) is_recorders: bool,
+}
+
+/// The stamps of a file with one time in seconds a line.
+///
+/// A last line of the recorder's that breaks off says nothing: its pair was not whole.
+pub(super) fn times(file: &Path) -> Result<Times, DatasetError> {
     let text = read(file)?;
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    let (before, last) = text.split_at(whole);
+    let is_recorders = lines(before).all(|(_, word)| is_to_the_nanosecond(word));
+    let breaks_off = is_recorders && !last.is_empty() && !is_to_the_nanosecond(last);
+    let told = if breaks_off { before } else { &text };
+    Ok(Times {
+        ns: times_ns(file, told)?,
+        is_recorders: is_recorders
+            && (breaks_off || lines(last).all(|(_, w)| is_to_the_nanosecond(w))),
+    })
+}
+
+/// Whether a time is written with nine digits behind the point.
+fn is_to_the_nanosecond(word: &str) -> bool {
+    let is_digits = |part: &str| part.bytes().all(|b| b.is_ascii_digit());
+    word.split_once('.').is_some_and(|(whole, fraction)| {
+        is_digits(whole.strip_prefix('-').unwrap_or(whole))
+            && fraction.len() == 9
+            && is_digits(fraction)
+    })
+}
+
+fn times_ns(file: &Path, text: &str) -> Result<Vec<i64>, DatasetError> {
     let mut times: Vec<i64> = Vec::new();
-    for (line, word) in lines(&text) {
+    for (line, word) in lines(text) {
         let time = ns_from_seconds(word).ok_or_else(|| {
             DatasetError::line(
                 file,

@@ -12,6 +12,8 @@ mod c_header;
 #[cfg(test)]
 mod calibrate;
 #[cfg(test)]
+mod cuts;
+#[cfg(test)]
 mod evaluate;
 #[cfg(test)]
 mod features;

@@ -11,8 +11,8 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{self, Seek, Write};
 
-/// Writes a recording; [`finish`](Self::finish) says whether all of it arrived. Without, what was
-/// written can be read up to the last second, in which diagnostics came.
+/// Writes a recording; [`finish`](Self::finish) says whether all of it arrived. Without, and wherever the file is
+/// cut, every pair that was added before can be read.
 pub struct McapWriter<W: Write + Seek> {
     topics: Topics,
     channels: Channels<W>,
@@ -76,7 +76,8 @@ impl<W: Write + Seek> McapWriter<W> {
         let channels = &mut self.channels;
         self.topics.tell(estimate, features, images, channels)?;
         channels.number = channels.number.wrapping_add(1);
-        Ok(())
+        // Ends the chunk: one that is still open has no length yet, so that nothing in it could be read.
+        channels.out.flush().map_err(io_error)
     }
 
     /// Ends the file with its index.
@@ -105,11 +106,7 @@ impl<W: Write + Seek> Audience for Channels<W> {
         };
         self.out
             .write_to_known_channel(&header, message)
-            .map_err(io_error)?;
-        match topic {
-            Topic::Diagnostics => self.out.flush().map_err(io_error),
-            _ => Ok(()),
-        }
+            .map_err(io_error)
     }
 }
 
