@@ -21,6 +21,9 @@ pub const MAX_SIDE_PX: u32 = 16_384;
 pub const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Most memory that the decoded samples of one image may take, bytes.
 const MAX_SAMPLE_BYTES: u64 = 1 << 30;
+/// Most bytes of pixels that a byte of a file can stand for: 1032 in PNG, fewer in the others. A header that
+/// claims more is not followed by its image, and must not take memory for it.
+const MAX_COMPRESSION: u64 = 1032;
 
 /// Decodes one file after the other with the same buffers.
 #[derive(Debug)]
@@ -65,6 +68,7 @@ impl Decoder {
         self.file_bytes.clear();
         read(file, &mut self.file_bytes)?;
         let mut target = Target {
+            file_bytes: self.file_bytes.len(),
             expected_px,
             white_level: self.white_level,
             samples: &mut self.samples,
@@ -88,6 +92,7 @@ impl Decoder {
         image: &mut GrayImage,
     ) -> Result<(), DecodeError> {
         let mut target = Target {
+            file_bytes: bytes.len(),
             expected_px,
             white_level: self.white_level,
             samples: &mut self.samples,
@@ -196,6 +201,7 @@ fn plain_grey(bytes: &[u8]) -> Option<((u32, u32), &[u8])> {
 
 /// Where an image goes, and under which conditions.
 struct Target<'a> {
+    file_bytes: usize,
     expected_px: Option<(u32, u32)>,
     white_level: u16,
     samples: &'a mut Vec<u8>,
@@ -228,6 +234,7 @@ impl Target<'_> {
             Format::Jpeg => {
                 let mut decoder = jpeg::Jpeg::open(bytes)?;
                 let size = decoder.size_px();
+                self.admit_stored(size, 8)?;
                 self.admit(size, decoder.bytes_per_pixel())?;
                 if decoder.bytes_per_pixel() == 1 {
                     return decoder.read(self.image.pixels_mut());
@@ -259,8 +266,18 @@ impl Target<'_> {
         Ok(())
     }
 
+    /// Refuses a header whose image cannot be in so short a file.
+    fn admit_stored(&self, (width, height): (u32, u32), bits_per_pixel: u16) -> Result<(), Fault> {
+        let bits = u64::from(width) * u64::from(height) * u64::from(bits_per_pixel);
+        if bits / 8 > self.file_bytes as u64 * MAX_COMPRESSION {
+            return Err(Fault::Truncated);
+        }
+        Ok(())
+    }
+
     fn fill(&mut self, decoder: impl ImageDecoder, white_level: u16) -> Result<(), Fault> {
         let (size, color) = (decoder.dimensions(), decoder.color_type());
+        self.admit_stored(size, decoder.original_color_type().bits_per_pixel())?;
         self.admit(size, color.bytes_per_pixel())?;
         if color == ColorType::L8 {
             return Ok(decoder.read_image(self.image.pixels_mut())?);

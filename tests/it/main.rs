@@ -12,6 +12,8 @@ mod c_header;
 #[cfg(test)]
 mod calibrate;
 #[cfg(test)]
+mod corpora;
+#[cfg(test)]
 mod cuts;
 #[cfg(test)]
 mod evaluate;
@@ -59,6 +61,8 @@ mod samples;
 #[cfg(test)]
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod service;
+#[cfg(test)]
+mod supply_chain;
 #[cfg(test)]
 #[cfg(feature = "v4l")]
 mod v4l2;

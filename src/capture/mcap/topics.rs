@@ -51,6 +51,18 @@ impl ImageTopic {
     }
 }
 
+/// Most topics with images or calibrations that are looked at.
+const MAX_TOPICS: usize = 256;
+/// Most that are named in a message.
+const MAX_NAMED: usize = 8;
+/// Longest name, bytes: ROS takes none that is longer.
+const MAX_NAME_BYTES: usize = 255;
+
+/// Whether ROS could name anything so.
+fn is_a_name(name: &str) -> bool {
+    name.len() <= MAX_NAME_BYTES && !name.contains(char::is_control)
+}
+
 /// What is known of a recording's topics.
 #[derive(Default)]
 pub(super) struct Topics {
@@ -65,11 +77,16 @@ impl Topics {
     }
 
     pub(super) fn add_schema(&mut self, id: u16, name: &str) {
-        self.schemas.insert(id, name.to_owned());
+        if is_a_name(name) {
+            self.schemas.insert(id, name.to_owned());
+        }
     }
 
     pub(super) fn add_channel(&mut self, channel: Channel) {
-        if channel.message_encoding != "cdr" {
+        if channel.message_encoding != "cdr"
+            || !is_a_name(&channel.topic)
+            || self.images.len() + self.camera_infos.len() >= MAX_TOPICS
+        {
             return;
         }
         let Some(schema) = self.schemas.get(&channel.schema_id) else {
@@ -133,6 +150,9 @@ impl Topics {
         let names: Vec<&str> = self.images.values().map(|t| t.name.as_str()).collect();
         let there = match names.as_slice() {
             [] => "it has none".to_owned(),
+            [names @ .., _] if names.len() >= MAX_NAMED => {
+                format!("it has {} and others", names[..MAX_NAMED].join(", "))
+            }
             names => format!("it has {}", names.join(", ")),
         };
         let cause = match wanted {

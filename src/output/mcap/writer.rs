@@ -1,7 +1,7 @@
 //! The file: channels, what goes on them, and when it is on the disk.
 
 use crate::estimation::{Odometry, TrackedFeature};
-use crate::geometry::{StereoRig, rig_to_toml};
+use crate::geometry::{COVARIANCE_FILE, StereoRig, rig_to_toml, with_covariance_beside};
 use crate::image::GrayImage;
 use crate::output::topics::{Audience, Purpose, Topic, Topics};
 use crate::ros::RIG_ATTACHMENT;
@@ -40,15 +40,13 @@ impl<W: Write + Seek> McapWriter<W> {
             .library(concat!("visod ", env!("CARGO_PKG_VERSION")))
             .create(out)
             .map_err(io_error)?;
-        let toml = rig_to_toml(rig);
-        out.attach(&Attachment {
-            log_time: 0,
-            create_time: 0,
-            name: RIG_ATTACHMENT.to_owned(),
-            media_type: "application/toml".to_owned(),
-            data: Cow::Borrowed(toml.as_bytes()),
-        })
-        .map_err(io_error)?;
+        // The covariance first: a reader that has found the rig looks no further.
+        let (rig_beside, covariance) = with_covariance_beside(rig);
+        if let Some(csv) = covariance {
+            attach(&mut out, COVARIANCE_FILE, "text/csv", &csv)?;
+        }
+        let toml = rig_to_toml(&rig_beside);
+        attach(&mut out, RIG_ATTACHMENT, "application/toml", &toml)?;
         let mut ids = [0; Topic::ALL.len()];
         for (id, topic) in ids.iter_mut().zip(Topic::ALL) {
             *id = add_channel(&mut out, topic).map_err(io_error)?;
@@ -108,6 +106,22 @@ impl<W: Write + Seek> Audience for Channels<W> {
             .write_to_known_channel(&header, message)
             .map_err(io_error)
     }
+}
+
+fn attach<W: Write + Seek>(
+    out: &mut mcap::Writer<W>,
+    name: &str,
+    media_type: &str,
+    text: &str,
+) -> io::Result<()> {
+    out.attach(&Attachment {
+        log_time: 0,
+        create_time: 0,
+        name: name.to_owned(),
+        media_type: media_type.to_owned(),
+        data: Cow::Borrowed(text.as_bytes()),
+    })
+    .map_err(io_error)
 }
 
 fn add_channel<W: Write + Seek>(out: &mut mcap::Writer<W>, topic: Topic) -> mcap::McapResult<u16> {

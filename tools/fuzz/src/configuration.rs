@@ -1,6 +1,6 @@
 //! The configuration.
 
-use crate::sentence;
+use super::sentence;
 use visod::config::Config;
 
 /// Any text is a configuration or refused.

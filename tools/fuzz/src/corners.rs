@@ -1,6 +1,6 @@
 //! Points of a calibration board that were found elsewhere.
 
-use crate::sentence;
+use super::sentence;
 use visod::calibration::{Board, Pattern, views_from_csv, views_to_csv};
 
 /// Any text is a list of views, which is written so that it reads back, or refused.

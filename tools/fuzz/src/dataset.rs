@@ -1,7 +1,7 @@
 //! Folders with recordings, of every layout.
 
-use crate::folder::Folder;
-use crate::sentence;
+use super::folder::Folder;
+use super::sentence;
 use std::path::Component;
 use visod::capture::Dataset;
 use visod::capture::dataset::ImageFiles;
@@ -24,8 +24,14 @@ pub fn run(data: &[u8]) {
             match &pair.images {
                 ImageFiles::Both { left, right } => {
                     for file in [left, right] {
-                        let within = file.strip_prefix(folder.path()).expect("a file of the recording");
-                        assert!(within.components().all(|c| matches!(c, Component::Normal(_))));
+                        let within = file
+                            .strip_prefix(folder.path())
+                            .expect("a file of the recording");
+                        assert!(
+                            within
+                                .components()
+                                .all(|c| matches!(c, Component::Normal(_)))
+                        );
                     }
                 }
                 ImageFiles::Unpaired { why } => sentence::check(why),

@@ -17,7 +17,11 @@ impl Folder {
     /// An empty folder, in memory where there is such a place.
     pub fn new() -> Self {
         let memory = Path::new("/dev/shm");
-        let parent = if memory.is_dir() { memory.to_owned() } else { std::env::temp_dir() };
+        let parent = if memory.is_dir() {
+            memory.to_owned()
+        } else {
+            std::env::temp_dir()
+        };
         let number = NEXT.fetch_add(1, Ordering::Relaxed);
         let path = parent.join(format!("visod-fuzz-{}-{number}", std::process::id()));
         std::fs::create_dir_all(&path).expect("a folder can be made");
@@ -44,7 +48,10 @@ impl Folder {
             let name = String::from_utf8_lossy(&part[..end]);
             let content = part.get(end + 1..).unwrap_or_default();
             let is_plain = |word: &str| {
-                !word.is_empty() && word.len() < 64 && !word.starts_with("..") && !word.contains('\0')
+                !word.is_empty()
+                    && word.len() < 64
+                    && !word.starts_with("..")
+                    && !word.contains('\0')
             };
             if name.split('/').count() > 4 || !name.split('/').all(is_plain) {
                 continue;
@@ -74,7 +81,9 @@ pub fn split<'a>(bytes: &'a [u8], mark: &'a [u8]) -> impl Iterator<Item = &'a [u
     };
     std::iter::from_fn(move || {
         let start = (0..rest.len()).find(|at| starts(*at, rest))? + mark.len();
-        let end = (start..rest.len()).find(|at| starts(*at, rest)).unwrap_or(rest.len());
+        let end = (start..rest.len())
+            .find(|at| starts(*at, rest))
+            .unwrap_or(rest.len());
         let part = &rest[start..end];
         rest = &rest[end..];
         Some(part)

@@ -1,6 +1,6 @@
 //! Image files.
 
-use crate::sentence;
+use super::sentence;
 use visod::capture::decode::{Decoder, MAX_SIDE_PX};
 use visod::image::GrayImage;
 
@@ -12,7 +12,10 @@ pub fn run(data: &[u8]) {
         match decoder.decode_bytes("image", data, expected, &mut image) {
             Ok(()) => {
                 assert!(image.width().max(image.height()) <= MAX_SIDE_PX);
-                assert_eq!(image.pixels().len(), image.width() as usize * image.height() as usize);
+                assert_eq!(
+                    image.pixels().len(),
+                    image.width() as usize * image.height() as usize
+                );
                 assert!(expected.is_none_or(|size| size == (image.width(), image.height())));
             }
             Err(why) => sentence::check(&why.to_string()),

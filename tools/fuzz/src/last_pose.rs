@@ -1,7 +1,7 @@
 //! The file that the run before has left.
 
-use crate::folder::Folder;
-use crate::sentence;
+use super::folder::Folder;
+use super::sentence;
 use visod::output::last_pose::{Legacy, Settings};
 
 /// Any bytes are a last pose, or a warning and a fresh beginning.
@@ -18,6 +18,12 @@ pub fn run(data: &[u8]) {
     }
     if let Some(start) = &legacy.start {
         assert!(start.cov_pose.cholesky().is_some());
-        assert!(start.odom_from_camera.to_homogeneous().iter().all(|v| v.is_finite()));
+        assert!(
+            start
+                .odom_from_camera
+                .to_homogeneous()
+                .iter()
+                .all(|v| v.is_finite())
+        );
     }
 }

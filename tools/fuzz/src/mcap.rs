@@ -1,7 +1,7 @@
 //! MCAP recordings.
 
-use crate::folder::Folder;
-use crate::sentence;
+use super::folder::Folder;
+use super::sentence;
 use visod::capture::dataset::Settings;
 use visod::capture::mcap::McapRecording;
 use visod::capture::{PairEvent, PairSource};
@@ -25,7 +25,10 @@ pub fn run(data: &[u8]) {
         while let Some(event) = source.next_event() {
             match event {
                 PairEvent::Pair(pair) => {
-                    assert!(last_ns.is_none_or(|last| pair.timestamp_ns > last), "stamps do not rise");
+                    assert!(
+                        last_ns.is_none_or(|last| pair.timestamp_ns > last),
+                        "stamps do not rise"
+                    );
                     last_ns = Some(pair.timestamp_ns);
                     source.recycle(pair);
                 }

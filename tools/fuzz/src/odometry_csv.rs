@@ -1,6 +1,6 @@
 //! Odometry CSV.
 
-use crate::sentence;
+use super::sentence;
 use std::path::Path;
 use visod::output::csv::{header_line, parse_odometry_csv, push_row};
 
@@ -19,7 +19,8 @@ pub fn run(data: &[u8]) {
                     written.push('\n');
                 }
             }
-            let again = parse_odometry_csv(name, written.as_bytes()).expect("what was written is read");
+            let again =
+                parse_odometry_csv(name, written.as_bytes()).expect("what was written is read");
             assert_eq!(again.len(), rows.len());
         }
         Err(why) => sentence::check(&why.to_string()),

@@ -1,6 +1,6 @@
 //! Rig files.
 
-use crate::sentence;
+use super::sentence;
 use visod::geometry::{check_rig, parse_rig, rig_to_toml};
 
 /// Any text is a rig, which is written so that it reads back, or refused.

@@ -1,6 +1,6 @@
 //! The covariance beside a rig file.
 
-use crate::sentence;
+use super::sentence;
 use visod::geometry::rig_parameters::{parse_rig_covariance, rig_covariance_to_csv};
 use visod::simulation::small_rig;
 
@@ -14,7 +14,10 @@ pub fn run(data: &[u8]) {
         Ok(covariance) => {
             assert!(covariance.iter().all(|v| v.is_finite()));
             let written = rig_covariance_to_csv(&rig, &covariance);
-            assert!(parse_rig_covariance(&rig, &written).is_ok(), "does not read back: {written}");
+            assert!(
+                parse_rig_covariance(&rig, &written).is_ok(),
+                "does not read back: {written}"
+            );
         }
         Err(why) => sentence::check(&why),
     }

@@ -1,7 +1,7 @@
 //! Calibrations of other tools.
 
-use crate::folder::{Folder, split};
-use crate::sentence;
+use super::folder::{Folder, split};
+use super::sentence;
 use visod::calibration::formats::{FORMATS, Hints, export, import};
 use visod::geometry::check_rig;
 
@@ -23,7 +23,11 @@ pub fn run(data: &[u8]) {
         .enumerate()
         .map(|(n, content)| folder.put(&format!("{n}.{ending}"), content))
         .collect();
-    let hints = Hints { format: format.copied(), size_px: Some((640, 480)), unit_m: None };
+    let hints = Hints {
+        format: format.copied(),
+        size_px: Some((640, 480)),
+        unit_m: None,
+    };
     match import(&files, &hints) {
         Ok(rig) => {
             let _ = check_rig(&rig);

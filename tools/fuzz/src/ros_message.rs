@@ -1,8 +1,10 @@
 //! Messages of ROS 2, as recordings hold them.
 
-use crate::sentence;
+use super::sentence;
 use visod::ros::camera_info::{Calibration, rig};
-use visod::ros::messages::{CameraInfo, CompressedImage, DiagnosticArray, Image, Odometry, PointCloud2, TfMessage};
+use visod::ros::messages::{
+    CameraInfo, CompressedImage, DiagnosticArray, Image, Odometry, PointCloud2, TfMessage,
+};
 use visod::ros::{CdrError, decode, encode};
 
 /// Any bytes are a message or refused; two calibrations that can be read are a rig or refused.
@@ -19,7 +21,11 @@ pub fn run(data: &[u8]) {
             encode(&info, &mut bytes).expect("what was read can be written");
             let mut other = info.clone();
             other.p.0[3] -= 100.0;
-            let of = |info| Calibration { topic: "/camera_info", info, is_rectified: false };
+            let of = |info| Calibration {
+                topic: "/camera_info",
+                info,
+                is_rectified: false,
+            };
             if let Err(why) = rig(of(&info), of(&other)) {
                 sentence::check(&why);
             }

@@ -7,7 +7,11 @@ const LONGEST: usize = 4000;
 /// cursor.
 pub fn check(sentence: &str) {
     assert!(!sentence.is_empty(), "a refusal says nothing");
-    assert!(sentence.len() <= LONGEST, "a refusal of {} bytes", sentence.len());
+    assert!(
+        sentence.len() <= LONGEST,
+        "a refusal of {} bytes",
+        sentence.len()
+    );
     assert!(
         !sentence.contains(char::is_control),
         "a refusal holds a control character: {sentence:?}"

@@ -1,6 +1,7 @@
 //! Messages in shared memory, where another process may write what it likes.
+#![expect(unsafe_code, reason = "any bytes become a message, as they do in shared memory")]
 
-use crate::sentence;
+use super::sentence;
 use visod::output::features::FeaturesMessage;
 use visod::output::health::HealthMessage;
 use visod::output::message::{MessageError, OdometryMessage};

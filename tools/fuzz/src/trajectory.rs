@@ -1,6 +1,6 @@
 //! Trajectories: truths and others' estimates.
 
-use crate::sentence;
+use super::sentence;
 use std::path::Path;
 use visod::evaluation::trajectory::parse_trajectory;
 
@@ -17,7 +17,10 @@ pub fn run(data: &[u8]) {
             if let Some(stamps) = &trajectory.stamps_ns {
                 assert_eq!(stamps.len(), trajectory.world_from_body.len());
                 for two in stamps.windows(2) {
-                    assert!(two[1].checked_sub(two[0]).is_some_and(|ns| ns > 0), "stamps do not rise");
+                    assert!(
+                        two[1].checked_sub(two[0]).is_some_and(|ns| ns > 0),
+                        "stamps do not rise"
+                    );
                 }
             }
         }
