@@ -156,6 +156,17 @@ mod tests {
     };
 
     #[test]
+    fn more_views_than_have_room_are_refused() {
+        let line = |n: usize| format!("v{n},left,0,1,2\n");
+        let lines: String = (0..MOST_VIEWS).map(line).collect();
+        let text = format!("{HEADER}\n{lines}");
+        let views = views_from_csv(&text, &BOARD).expect("as many as may be");
+        assert_eq!(views.len(), MOST_VIEWS);
+        let why = views_from_csv(&(text + &line(MOST_VIEWS)), &BOARD).expect_err("one more");
+        assert_eq!(why, "1002: more than 1000 views are not taken");
+    }
+
+    #[test]
     fn views_read_back_as_they_were_written() {
         let seen = |shift: f64| -> SeenPoints {
             (0..12)

@@ -217,7 +217,7 @@ impl Target<'_> {
             }
             Format::Pnm => {
                 if let Some((size, pixels)) = plain_grey(bytes) {
-                    self.admit(size, 1)?;
+                    self.admit(size, 1, 8)?;
                     self.image.pixels_mut().copy_from_slice(pixels);
                     return Ok(());
                 }
@@ -234,8 +234,7 @@ impl Target<'_> {
             Format::Jpeg => {
                 let mut decoder = jpeg::Jpeg::open(bytes)?;
                 let size = decoder.size_px();
-                self.admit_stored(size, 8)?;
-                self.admit(size, decoder.bytes_per_pixel())?;
+                self.admit(size, decoder.bytes_per_pixel(), 8)?;
                 if decoder.bytes_per_pixel() == 1 {
                     return decoder.read(self.image.pixels_mut());
                 }
@@ -248,7 +247,13 @@ impl Target<'_> {
     }
 
     /// Refuses an image by its header, before memory is taken, and makes room for its pixels.
-    fn admit(&mut self, size: (u32, u32), bytes_per_pixel: u8) -> Result<(), Fault> {
+    /// `stored_bits` are those of a pixel in the file, before compression.
+    fn admit(
+        &mut self,
+        size: (u32, u32),
+        bytes_per_pixel: u8,
+        stored_bits: u16,
+    ) -> Result<(), Fault> {
         let (width, height) = size;
         if let Some(expected) = self.expected_px
             && expected != size
@@ -262,23 +267,18 @@ impl Target<'_> {
         if width.min(height) == 0 {
             return Err(Fault::Damaged(format!("it has {width}×{height} px")));
         }
-        self.image.reshape(width, height);
-        Ok(())
-    }
-
-    /// Refuses a header whose image cannot be in so short a file.
-    fn admit_stored(&self, (width, height): (u32, u32), bits_per_pixel: u16) -> Result<(), Fault> {
-        let bits = u64::from(width) * u64::from(height) * u64::from(bits_per_pixel);
-        if bits / 8 > self.file_bytes as u64 * MAX_COMPRESSION {
+        let stored_bytes = u64::from(width) * u64::from(height) * u64::from(stored_bits) / 8;
+        if stored_bytes > self.file_bytes as u64 * MAX_COMPRESSION {
             return Err(Fault::Truncated);
         }
+        self.image.reshape(width, height);
         Ok(())
     }
 
     fn fill(&mut self, decoder: impl ImageDecoder, white_level: u16) -> Result<(), Fault> {
         let (size, color) = (decoder.dimensions(), decoder.color_type());
-        self.admit_stored(size, decoder.original_color_type().bits_per_pixel())?;
-        self.admit(size, color.bytes_per_pixel())?;
+        let stored_bits = decoder.original_color_type().bits_per_pixel();
+        self.admit(size, color.bytes_per_pixel(), stored_bits)?;
         if color == ColorType::L8 {
             return Ok(decoder.read_image(self.image.pixels_mut())?);
         }

@@ -222,6 +222,18 @@ mod tests {
     }
 
     #[test]
+    fn names_that_ros_does_not_take_and_topics_without_end_are_passed_over() {
+        let long = format!("/left/{}", "x".repeat(MAX_NAME_BYTES));
+        let there = chosen(&[(&long, false), ("/left/\x1b[2J", false)]);
+        assert!(there.expect_err("none").contains("it has none"));
+        let names: Vec<String> = (0..2 * MAX_TOPICS).map(|n| format!("/{n}/image")).collect();
+        let many: Vec<(&str, bool)> = names.iter().map(|name| (name.as_str(), false)).collect();
+        assert_eq!(topics(&many).images.len(), MAX_TOPICS);
+        let why = chosen(&many).expect_err("no side is named");
+        assert!(why.len() < 400 && why.contains("and others"), "{why}");
+    }
+
+    #[test]
     fn raw_pixels_go_before_image_files() {
         let both = chosen(&[
             ("/left/image_raw/compressed", true),

@@ -1,5 +1,8 @@
 //! Messages in shared memory, where another process may write what it likes.
-#![expect(unsafe_code, reason = "any bytes become a message, as they do in shared memory")]
+#![expect(
+    unsafe_code,
+    reason = "any bytes become a message, as they do in shared memory"
+)]
 
 use super::sentence;
 use visod::output::features::FeaturesMessage;
