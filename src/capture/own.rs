@@ -54,6 +54,12 @@ pub(super) fn stamped_pairs(
     } else {
         named
     };
+    if named.is_empty() {
+        return Err(DatasetError::file(
+            &times_file,
+            "has no time yet: the recording was cut off within its first pair",
+        ));
+    }
     if times.len() == named.len() {
         let pairs = times
             .into_iter()

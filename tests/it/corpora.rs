@@ -9,7 +9,7 @@ use rand_xoshiro::Xoshiro256PlusPlus;
 use std::path::PathBuf;
 
 /// Changes of each file.
-const CHANGES: usize = 100;
+const CHANGES: usize = 300;
 
 /// The files of one target, in order.
 fn corpus_of(target: &str) -> Vec<(PathBuf, Vec<u8>)> {

@@ -72,6 +72,7 @@ impl Stream {
         let read = |name: &str| std::fs::read(path.join(name)).unwrap();
         stream.push("rig.toml", read("rig.toml"));
         stream.push("frames.csv", read("frames.csv"));
+        stream.push("times.txt", Vec::new());
         let mut times = 0;
         for (n, pair) in pairs.iter().enumerate() {
             recorder.add(pair).unwrap();
@@ -104,7 +105,7 @@ impl Stream {
     fn write(&self, folder: &Path, mut left: usize) {
         use std::io::Write;
         for (name, bytes) in &self.pieces {
-            if left == 0 {
+            if left == 0 && !bytes.is_empty() {
                 return;
             }
             let file = folder.join(name);
