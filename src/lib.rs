@@ -40,6 +40,7 @@ pub mod service;
 pub mod settings;
 mod simd;
 pub mod simulation;
+mod text_file;
 mod toml_file;
 pub mod uncertainty;
 

@@ -19,6 +19,7 @@ macro_rules! widened {
                     $body($($argument),*)
                 }
                 if std::is_x86_feature_detected!("avx2") {
+                    #[expect(unsafe_code, reason = "the processor was asked")]
                     // SAFETY: the processor has AVX2, as just asked.
                     return unsafe { wide($($argument),*) };
                 }

@@ -1,11 +1,15 @@
 //! TOML files whose mistakes are reported with file, line and key.
 
+use crate::text_file::{self, one_line};
 use serde::de::DeserializeOwned;
 use std::ops::Range;
 use std::path::Path;
 
 /// Longest TOML file that is read, bytes; a rig or configuration has a few thousand.
-const MAX_BYTES: u64 = 1 << 20;
+pub(crate) const MAX_BYTES: u64 = 1 << 20;
+
+/// Longest part of a message that the file itself may make up, characters.
+const MAX_MESSAGE: usize = 500;
 
 /// What is wrong with a TOML file, and where.
 #[derive(Debug, Clone, PartialEq, Eq)]
@@ -45,21 +49,15 @@ impl TomlText {
     /// Reads a file.
     pub(crate) fn read(path: &Path) -> Result<Self, TomlError> {
         let file = path.display().to_string();
-        let fail = |cause: String| TomlError {
-            file: file.clone(),
-            line: None,
-            key: None,
-            cause,
-        };
-        let size = std::fs::metadata(path)
-            .map_err(|e| fail(format!("cannot be read: {e}")))?
-            .len();
-        if size > MAX_BYTES {
-            return Err(fail(format!("has {size} bytes, more than {MAX_BYTES}")));
+        match text_file::read(path, MAX_BYTES) {
+            Ok(text) => Ok(Self { file, text }),
+            Err(fault) => Err(TomlError {
+                file,
+                line: fault.line,
+                key: None,
+                cause: fault.cause,
+            }),
         }
-        let text =
-            std::fs::read_to_string(path).map_err(|e| fail(format!("cannot be read: {e}")))?;
-        Ok(Self { file, text })
     }
 
     /// Takes a text that came from elsewhere, under a name for messages.
@@ -75,8 +73,11 @@ impl TomlText {
         toml::from_str(&self.text).map_err(|e| TomlError {
             file: self.file.clone(),
             line: e.span().map(|span| self.line_at(&span)),
-            key: e.span().and_then(|span| self.key_at(&span)),
-            cause: e.message().replace('\n', " "),
+            key: e
+                .span()
+                .and_then(|span| self.key_at(&span))
+                .map(|key| one_line(&key, MAX_MESSAGE)),
+            cause: one_line(&e.message().replace('\n', " "), MAX_MESSAGE),
         })
     }
 

@@ -2,6 +2,7 @@
 //! counted, and told apart by the thread that asks for it and by what runs at that time.
 //!
 //! A binary of its own, and one test: another test's allocations would be counted, too.
+#![expect(unsafe_code, reason = "an allocator")]
 
 #[path = "../tools/bench/common/memory.rs"]
 #[cfg(test)]

@@ -1,6 +1,7 @@
 //! What was seen of the board: views in, and the file that they can be kept in.
 
 use super::Board;
+use crate::text_file::shown;
 use nalgebra::Vector2;
 use std::collections::BTreeMap;
 use std::fmt::Write as _;
@@ -65,6 +66,9 @@ fn quoted(name: &str) -> String {
     }
 }
 
+/// Most views that are read: each takes room for every point of the board, however few it saw.
+const MOST_VIEWS: usize = 1000;
+
 /// Reads what [`views_to_csv`] writes; views keep the order in which they first stand.
 ///
 /// # Errors
@@ -83,6 +87,9 @@ pub fn views_from_csv(text: &str, board: &Board) -> Result<Vec<View>, String> {
         let line = record.position().map_or(0, csv::Position::line);
         let fail = |cause: String| format!("{line}: {cause}");
         let (side, point, at) = entry(&record, board).map_err(fail)?;
+        if views.len() >= MOST_VIEWS && !places.contains_key(&record[0]) {
+            return Err(fail(format!("more than {MOST_VIEWS} views are not taken")));
+        }
         let place = *places.entry(record[0].to_owned()).or_insert_with(|| {
             views.push(View {
                 name: record[0].to_owned(),
@@ -93,8 +100,8 @@ pub fn views_from_csv(text: &str, board: &Board) -> Result<Vec<View>, String> {
         let seen = views[place].seen[side].get_or_insert_with(|| vec![None; board.len()]);
         if seen[point].replace(at).is_some() {
             return Err(fail(format!(
-                "point {point} of this side of view {:?} stands twice",
-                &record[0]
+                "point {point} of this side of view \"{}\" stands twice",
+                shown(&record[0])
             )));
         }
     }
@@ -108,20 +115,25 @@ fn entry(
     let side = match &record[1] {
         "left" => 0,
         "right" => 1,
-        other => return Err(format!("side must be left or right, but is {other:?}")),
+        other => {
+            let shown = shown(other);
+            return Err(format!("side must be left or right, but is \"{shown}\""));
+        }
     };
     let point = match record[2].parse::<usize>() {
         Ok(point) if point < board.len() => point,
         _ => {
             return Err(format!(
-                "{:?} is no point of a board with {} × {} points, numbered from 0",
-                &record[2], board.columns, board.rows
+                "\"{}\" is no point of a board with {} × {} points, numbered from 0",
+                shown(&record[2]),
+                board.columns,
+                board.rows
             ));
         }
     };
     let number = |word: &str| match word.trim().parse::<f64>() {
         Ok(value) if value.is_finite() => Ok(value),
-        _ => Err(format!("{word:?} is no position in px")),
+        _ => Err(format!("\"{}\" is no position in px", shown(word))),
     };
     Ok((
         side,
@@ -142,6 +154,17 @@ mod tests {
         square_m: 0.03,
         sigma_square_m: 0.0,
     };
+
+    #[test]
+    fn more_views_than_have_room_are_refused() {
+        let line = |n: usize| format!("v{n},left,0,1,2\n");
+        let lines: String = (0..MOST_VIEWS).map(line).collect();
+        let text = format!("{HEADER}\n{lines}");
+        let views = views_from_csv(&text, &BOARD).expect("as many as may be");
+        assert_eq!(views.len(), MOST_VIEWS);
+        let why = views_from_csv(&(text + &line(MOST_VIEWS)), &BOARD).expect_err("one more");
+        assert_eq!(why, "1002: more than 1000 views are not taken");
+    }
 
     #[test]
     fn views_read_back_as_they_were_written() {

@@ -21,6 +21,9 @@ pub const MAX_SIDE_PX: u32 = 16_384;
 pub const MAX_FILE_BYTES: u64 = 1 << 30;
 /// Most memory that the decoded samples of one image may take, bytes.
 const MAX_SAMPLE_BYTES: u64 = 1 << 30;
+/// Most bytes of pixels that a byte of a file can stand for: 1032 in PNG, fewer in the others. A header that
+/// claims more is not followed by its image, and must not take memory for it.
+const MAX_COMPRESSION: u64 = 1032;
 
 /// Decodes one file after the other with the same buffers.
 #[derive(Debug)]
@@ -65,6 +68,7 @@ impl Decoder {
         self.file_bytes.clear();
         read(file, &mut self.file_bytes)?;
         let mut target = Target {
+            file_bytes: self.file_bytes.len(),
             expected_px,
             white_level: self.white_level,
             samples: &mut self.samples,
@@ -88,6 +92,7 @@ impl Decoder {
         image: &mut GrayImage,
     ) -> Result<(), DecodeError> {
         let mut target = Target {
+            file_bytes: bytes.len(),
             expected_px,
             white_level: self.white_level,
             samples: &mut self.samples,
@@ -196,6 +201,7 @@ fn plain_grey(bytes: &[u8]) -> Option<((u32, u32), &[u8])> {
 
 /// Where an image goes, and under which conditions.
 struct Target<'a> {
+    file_bytes: usize,
     expected_px: Option<(u32, u32)>,
     white_level: u16,
     samples: &'a mut Vec<u8>,
@@ -211,7 +217,7 @@ impl Target<'_> {
             }
             Format::Pnm => {
                 if let Some((size, pixels)) = plain_grey(bytes) {
-                    self.admit(size, 1)?;
+                    self.admit(size, 1, 8)?;
                     self.image.pixels_mut().copy_from_slice(pixels);
                     return Ok(());
                 }
@@ -228,7 +234,7 @@ impl Target<'_> {
             Format::Jpeg => {
                 let mut decoder = jpeg::Jpeg::open(bytes)?;
                 let size = decoder.size_px();
-                self.admit(size, decoder.bytes_per_pixel())?;
+                self.admit(size, decoder.bytes_per_pixel(), 8)?;
                 if decoder.bytes_per_pixel() == 1 {
                     return decoder.read(self.image.pixels_mut());
                 }
@@ -241,7 +247,13 @@ impl Target<'_> {
     }
 
     /// Refuses an image by its header, before memory is taken, and makes room for its pixels.
-    fn admit(&mut self, size: (u32, u32), bytes_per_pixel: u8) -> Result<(), Fault> {
+    /// `stored_bits` are those of a pixel in the file, before compression.
+    fn admit(
+        &mut self,
+        size: (u32, u32),
+        bytes_per_pixel: u8,
+        stored_bits: u16,
+    ) -> Result<(), Fault> {
         let (width, height) = size;
         if let Some(expected) = self.expected_px
             && expected != size
@@ -255,13 +267,18 @@ impl Target<'_> {
         if width.min(height) == 0 {
             return Err(Fault::Damaged(format!("it has {width}×{height} px")));
         }
+        let stored_bytes = u64::from(width) * u64::from(height) * u64::from(stored_bits) / 8;
+        if stored_bytes > self.file_bytes as u64 * MAX_COMPRESSION {
+            return Err(Fault::Truncated);
+        }
         self.image.reshape(width, height);
         Ok(())
     }
 
     fn fill(&mut self, decoder: impl ImageDecoder, white_level: u16) -> Result<(), Fault> {
         let (size, color) = (decoder.dimensions(), decoder.color_type());
-        self.admit(size, color.bytes_per_pixel())?;
+        let stored_bits = decoder.original_color_type().bits_per_pixel();
+        self.admit(size, color.bytes_per_pixel(), stored_bits)?;
         if color == ColorType::L8 {
             return Ok(decoder.read_image(self.image.pixels_mut())?);
         }

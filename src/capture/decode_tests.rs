@@ -7,6 +7,7 @@ use proptest::prelude::*;
 fn decode_with(white_level: u16, bytes: &[u8]) -> Result<GrayImage, String> {
     let mut image = GrayImage::default();
     let mut target = Target {
+        file_bytes: bytes.len(),
         expected_px: None,
         white_level,
         samples: &mut Vec::new(),
@@ -106,24 +107,26 @@ fn colour_becomes_grey_with_the_weights_of_luma_and_alpha_is_ignored() {
     }
 }
 
+/// The checksum of a chunk.
+fn png_crc(bytes: &[u8]) -> u32 {
+    !bytes.iter().fold(u32::MAX, |mut crc, &byte| {
+        crc ^= u32::from(byte);
+        for _ in 0..8 {
+            crc = (crc >> 1) ^ (0xEDB8_8320 & (crc & 1).wrapping_neg());
+        }
+        crc
+    })
+}
+
 /// A PNG of a palette (1 bit a pixel: black and RGB 10, 20, 30), written by hand with no
 /// compression, as the encoder at hand writes none.
 fn palette_png() -> Vec<u8> {
-    let crc = |bytes: &[u8]| {
-        !bytes.iter().fold(u32::MAX, |mut crc, &byte| {
-            crc ^= u32::from(byte);
-            for _ in 0..8 {
-                crc = (crc >> 1) ^ (0xEDB8_8320 & (crc & 1).wrapping_neg());
-            }
-            crc
-        })
-    };
     let mut png = b"\x89PNG\r\n\x1a\n".to_vec();
     let mut chunk = |name: &[u8], data: &[u8]| {
         png.extend((data.len() as u32).to_be_bytes());
         let body = [name, data].concat();
         png.extend(&body);
-        png.extend(crc(&body).to_be_bytes());
+        png.extend(png_crc(&body).to_be_bytes());
     };
     chunk(b"IHDR", &[0, 0, 0, 4, 0, 0, 0, 1, 1, 3, 0, 0, 0]);
     chunk(b"PLTE", &[0, 0, 0, 10, 20, 30]);
@@ -229,6 +232,29 @@ fn a_header_that_promises_too_much_is_refused_before_memory_is_taken() {
     }
     let zero = decode(b"P5 0 4 255\n").expect_err("no pixel");
     assert!(zero.contains("is damaged"), "{zero}");
+}
+
+/// Both headers are within the limits of images, but what should follow cannot fit into so few bytes.
+#[test]
+fn a_header_without_its_image_takes_no_memory() {
+    let (width, height) = (MAX_SIDE_PX, MAX_SIDE_PX);
+    let mut image = GrayImage::default();
+    let tiny = png_of(8, 8, &pattern(8, 8), ExtendedColorType::L8);
+    let mut png = tiny.clone();
+    png[16..20].copy_from_slice(&width.to_be_bytes());
+    png[20..24].copy_from_slice(&height.to_be_bytes());
+    let crc = png_crc(&png[12..29]);
+    png[29..33].copy_from_slice(&crc.to_be_bytes());
+    let pgm = format!("P5\n{width} {height}\n65535\n").into_bytes();
+    for bytes in [png, pgm] {
+        let decoded = Decoder::default().decode_bytes("image", &bytes, None, &mut image);
+        let why = decoded.expect_err("no image").to_string();
+        assert!(why.contains("ends before the image does"), "{why}");
+        assert_eq!(image.pixels().len(), 0);
+    }
+    // All black, and as short as the format allows.
+    let black = png_of(2048, 2048, &vec![0; 2048 * 2048], ExtendedColorType::L8);
+    assert!(decode(&black).is_ok(), "{} bytes", black.len());
 }
 
 #[test]

@@ -1,5 +1,6 @@
 //! The stamped images of two EuRoC cameras in; pairs by stamp out.
 
+use super::MAX_STAMP_NS;
 use super::dataset::{DatasetError, ImageFiles, PairFiles};
 use super::own::images_in;
 use super::text;
@@ -84,9 +85,9 @@ impl Frames {
     }
 }
 
-/// A stamp within ±2^62 ns, so that differences of two fit as well.
 fn stamp_ns(word: &str) -> Option<i64> {
-    word.parse().ok().filter(|ns: &i64| ns.abs() < 1 << 62)
+    let is_in_range = |ns: &i64| ns.unsigned_abs() < MAX_STAMP_NS.unsigned_abs();
+    word.parse().ok().filter(is_in_range)
 }
 
 /// One name that stays in its folder: no separator, no `..`, no root.

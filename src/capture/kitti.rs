@@ -73,7 +73,7 @@ pub(crate) struct Calibration {
 
 impl Calibration {
     pub(crate) fn read(file: &Path) -> Result<Self, DatasetError> {
-        let text = text::read(file)?;
+        let text = text::read_calibration(file)?;
         let find = |key: &str| {
             text::lines(&text)
                 .filter_map(|(line, words)| Some((line, words.split_once(':')?)))

@@ -40,7 +40,7 @@ pub mod read_ahead;
 pub mod recorder;
 pub mod settings;
 mod supervisor;
-mod text;
+pub(crate) mod text;
 #[cfg(feature = "v4l")]
 pub mod v4l2;
 pub(crate) mod yaml;
@@ -53,6 +53,9 @@ pub use read_ahead::ReadAhead;
 pub use supervisor::Opener;
 
 use crate::image::GrayImage;
+
+/// Stamps that are read lie below, ns, about 146 years either way, so that differences of two fit as well.
+pub(crate) const MAX_STAMP_NS: i64 = 1 << 62;
 
 /// Which of the two cameras.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]

@@ -45,7 +45,21 @@ pub(super) fn stamped_pairs(
         });
         return Ok((pairs.collect(), true));
     }
-    let times = text::times_ns(&times_file)?;
+    let text::Times {
+        ns: times,
+        is_recorders,
+    } = text::times(&times_file)?;
+    let named = if is_recorders {
+        without_cut_pair(named, times.len())
+    } else {
+        named
+    };
+    if named.is_empty() {
+        return Err(DatasetError::file(
+            &times_file,
+            "has no time yet: the recording was cut off within its first pair",
+        ));
+    }
     if times.len() == named.len() {
         let pairs = times
             .into_iter()
@@ -70,6 +84,14 @@ pub(super) fn stamped_pairs(
                 ),
             )
         })
+}
+
+/// The recorder writes a pair's images first, numbered from 0, then its time: the one pair that has images
+/// but no time was being written when the recording was cut off.
+fn without_cut_pair(mut named: Vec<(Stem, ImageFiles)>, times: usize) -> Vec<(Stem, ImageFiles)> {
+    let is_cut = |(stem, _): &mut (Stem, ImageFiles)| stem.number == Some(times as u64);
+    named.pop_if(is_cut);
+    named
 }
 
 /// Part of a recording whose `times.txt` is that of the whole: the image's number is its line.

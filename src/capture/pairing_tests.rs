@@ -260,4 +260,44 @@ proptest! {
             }
         }
     }
+
+    /// Two cameras that expose together and lose frames: whatever the order in which their frames come, as long
+    /// as neither runs far ahead, the pairs are those of the frames that both have.
+    #[test]
+    fn the_interleaving_of_two_cameras_makes_no_difference(
+        kept in prop::collection::vec(any::<[bool; 2]>(), 1..80),
+        jitter_ns in prop::collection::vec(-MS..MS, 80),
+        turns in prop::collection::vec(any::<bool>(), 160),
+    ) {
+        const LEAD: usize = MAX_WAITING - 2;
+        let frames = [0, 1].map(|side| {
+            let is_kept = |n: &usize| kept[*n][side];
+            (0..kept.len()).filter(is_kept).collect::<Vec<_>>()
+        });
+        let stamp_ns = |side: usize, n: usize| {
+            n as i64 * PERIOD_NS + if side == 1 { jitter_ns[n] } else { 0 }
+        };
+        let mut pairer = Pairer::new(PairBy::Stamp, 5 * MS);
+        let mut next = [0, 0];
+        let mut all = Vec::new();
+        let mut turns = turns.iter().cycle();
+        while next != [frames[0].len(), frames[1].len()] {
+            // The numbers of the frames that come next; one that has none left is not waited for.
+            let at = [0, 1].map(|side: usize| frames[side].get(next[side]).copied().unwrap_or(usize::MAX));
+            let is_right = usize::from(turns.next() == Some(&true));
+            let other = 1 - is_right;
+            let runs_ahead = at[is_right] == usize::MAX || at[is_right] > at[other].saturating_add(LEAD);
+            let side = if runs_ahead { other } else { is_right };
+            let n = at[side];
+            pairer.push([Side::Left, Side::Right][side], frame(n as u64, stamp_ns(side, n)));
+            next[side] += 1;
+            all.extend(outcomes(&mut pairer));
+        }
+        pairer.reopen(Side::Left);
+        pairer.reopen(Side::Right);
+        all.extend(outcomes(&mut pairer));
+        let (pairs, _) = summary(&all);
+        let both = (0..kept.len()).filter(|n| kept[*n] == [true; 2]).map(|n| (n as u64, n as u64));
+        prop_assert_eq!(pairs, both.collect::<Vec<_>>());
+    }
 }

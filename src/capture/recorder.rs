@@ -6,7 +6,7 @@
 
 use super::StereoPair;
 use super::live::{Entry, Fate, name_of};
-use crate::geometry::{StereoRig, rig_to_toml};
+use crate::geometry::{StereoRig, save_rig};
 use crate::image::GrayImage;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -66,8 +66,7 @@ impl Recorder {
             let part = folder.join(name);
             std::fs::create_dir_all(&part).map_err(|cause| write_error(&part, cause))?;
         }
-        let rig_file = folder.join("rig.toml");
-        std::fs::write(&rig_file, rig_to_toml(rig)).map_err(|e| write_error(&rig_file, e))?;
+        save_rig(folder, rig).map_err(|(file, cause)| write_error(&file, cause))?;
         let mut frames = Growing::create(folder.join("frames.csv"))?;
         frames.add(FRAMES_HEADER)?;
         Ok(Self {

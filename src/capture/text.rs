@@ -1,29 +1,35 @@
 //! Small text files in; lines, numbers and stamps out, with file and line of what is wrong.
 
+use super::MAX_STAMP_NS;
 use super::dataset::DatasetError;
+use crate::text_file;
+pub(super) use crate::text_file::shown;
 use std::path::Path;
 
 /// Longest text file that is read, bytes: stamps of millions of frames.
 const MAX_BYTES: u64 = 256 << 20;
 
-/// Reads a text file.
+/// Longest calibration that is read, bytes; the usual ones have a few thousand.
+const MAX_CALIBRATION_BYTES: u64 = 1 << 20;
+
+/// Reads a list of stamps.
 pub(super) fn read(file: &Path) -> Result<String, DatasetError> {
-    let unreadable = |e: std::io::Error| DatasetError::file(file, format!("cannot be read: {e}"));
-    let meta = std::fs::metadata(file).map_err(unreadable)?;
-    if !meta.is_file() {
+    read_at_most(file, MAX_BYTES)
+}
+
+/// Reads a calibration.
+pub(crate) fn read_calibration(file: &Path) -> Result<String, DatasetError> {
+    read_at_most(file, MAX_CALIBRATION_BYTES)
+}
+
+fn read_at_most(file: &Path, most_bytes: u64) -> Result<String, DatasetError> {
+    // Nothing but a file stands in a recording; a pipe would be waited for.
+    if std::fs::metadata(file).is_ok_and(|meta| !meta.is_file()) {
         return Err(DatasetError::file(file, "is not a file"));
     }
-    if meta.len() > MAX_BYTES {
-        return Err(DatasetError::file(
-            file,
-            format!("has {} bytes, more than {MAX_BYTES}", meta.len()),
-        ));
-    }
-    let bytes = std::fs::read(file).map_err(unreadable)?;
-    String::from_utf8(bytes).map_err(|e| {
-        let before = &e.as_bytes()[..e.utf8_error().valid_up_to()];
-        let line = 1 + before.iter().filter(|&&b| b == b'\n').count();
-        DatasetError::line(file, line, "is not UTF-8 text")
+    text_file::read(file, most_bytes).map_err(|fault| DatasetError {
+        line: fault.line,
+        ..DatasetError::file(file, fault.cause)
     })
 }
 
@@ -35,11 +41,45 @@ pub(super) fn lines(text: &str) -> impl Iterator<Item = (usize, &str)> {
         .filter(|(_, line)| !line.is_empty() && !line.starts_with('#'))
 }
 
-/// The stamps of a file with one time in seconds a line, ns, strictly rising.
-pub(super) fn times_ns(file: &Path) -> Result<Vec<i64>, DatasetError> {
+/// The stamps of a recording.
+pub(super) struct Times {
+    /// When each pair was taken, ns, strictly rising.
+    pub(super) ns: Vec<i64>,
+    /// Whether all are written as visod's recorder writes them, to the nanosecond. Such a file may have been
+    /// cut off together with its images.
+    pub(super) is_recorders: bool,
+}
+
+/// The stamps of a file with one time in seconds a line.
+///
+/// A last line of the recorder's that breaks off says nothing: its pair was not whole.
+pub(super) fn times(file: &Path) -> Result<Times, DatasetError> {
     let text = read(file)?;
+    let whole = text.rfind('\n').map_or(0, |end| end + 1);
+    let (before, last) = text.split_at(whole);
+    let is_recorders = lines(before).all(|(_, word)| is_to_the_nanosecond(word));
+    let breaks_off = is_recorders && !last.is_empty() && !is_to_the_nanosecond(last);
+    let told = if breaks_off { before } else { &text };
+    Ok(Times {
+        ns: times_ns(file, told)?,
+        is_recorders: is_recorders
+            && (breaks_off || lines(last).all(|(_, w)| is_to_the_nanosecond(w))),
+    })
+}
+
+/// Whether a time is written with nine digits behind the point.
+fn is_to_the_nanosecond(word: &str) -> bool {
+    let is_digits = |part: &str| part.bytes().all(|b| b.is_ascii_digit());
+    word.split_once('.').is_some_and(|(whole, fraction)| {
+        is_digits(whole.strip_prefix('-').unwrap_or(whole))
+            && fraction.len() == 9
+            && is_digits(fraction)
+    })
+}
+
+fn times_ns(file: &Path, text: &str) -> Result<Vec<i64>, DatasetError> {
     let mut times: Vec<i64> = Vec::new();
-    for (line, word) in lines(&text) {
+    for (line, word) in lines(text) {
         let time = ns_from_seconds(word).ok_or_else(|| {
             DatasetError::line(
                 file,
@@ -80,25 +120,11 @@ pub(super) fn ns_from_seconds(word: &str) -> Option<i64> {
         let whole_ns = whole.parse::<i64>().ok()?.checked_mul(1_000_000_000)?;
         return whole_ns
             .checked_add((tenths_of_ns + 5) / 10)
+            .filter(|ns| *ns < MAX_STAMP_NS)
             .map(|ns| sign * ns);
     }
     let ns = (word.parse::<f64>().ok()? * 1e9).round();
-    // Up to 2^62 ns, about 146 years, so that differences fit as well.
-    (ns.abs() < (1_i64 << 62) as f64).then_some(ns as i64)
-}
-
-/// A word from a file as it may be shown in a message: short, on one line.
-pub(super) fn shown(word: &str) -> String {
-    const LONGEST: usize = 40;
-    let mut shown: String = word
-        .chars()
-        .take(LONGEST)
-        .map(|c| if c.is_control() { '\u{FFFD}' } else { c })
-        .collect();
-    if word.chars().nth(LONGEST).is_some() {
-        shown.push('…');
-    }
-    shown
+    (ns.abs() < MAX_STAMP_NS as f64).then_some(ns as i64)
 }
 
 #[cfg(test)]
@@ -115,6 +141,7 @@ mod tests {
             ("2.0000000005", 2_000_000_001),
             ("1.036224e-01", 103_622_400),
             ("5.", 5_000_000_000),
+            ("4611686018.427387903", MAX_STAMP_NS - 1),
         ] {
             assert_eq!(ns_from_seconds(word), Some(ns), "{word}");
         }
@@ -132,6 +159,7 @@ mod tests {
             "1 2",
             "99999999999999999999",
             "9300000000",
+            "4611686018.427387904",
         ] {
             assert_eq!(ns_from_seconds(word), None, "{word}");
         }

@@ -10,6 +10,8 @@ use std::path::{Path, PathBuf};
 
 /// Deepest nesting that a calibration may have.
 const MAX_DEPTH: usize = 32;
+/// Most keys of one map; those of calibrations have a dozen.
+const MAX_KEYS: usize = 1000;
 
 /// A value and the line it starts on, counted from 1.
 #[derive(Debug)]
@@ -35,7 +37,7 @@ pub(crate) struct YamlFile {
 
 impl YamlFile {
     pub(crate) fn read(file: &Path) -> Result<Self, DatasetError> {
-        Self::parse(file, &text::read(file)?)
+        Self::parse(file, &text::read_calibration(file)?)
     }
 
     fn parse(file: &Path, yaml: &str) -> Result<Self, DatasetError> {
@@ -178,6 +180,9 @@ impl Builder {
                 if entries.iter().any(|(k, _)| *k == key) {
                     return Err("a key stands twice");
                 }
+                if entries.len() >= MAX_KEYS {
+                    return Err("has too many keys");
+                }
                 entries.push((key, node));
             }
             (Value::Map(_), None) => match node.value {
@@ -239,6 +244,11 @@ mod tests {
         assert_eq!(
             parse("a: 1\na: 2\n").expect_err("twice"),
             "sensor.yaml:2: a key stands twice"
+        );
+        let keys: String = (0..=MAX_KEYS).map(|i| format!("k{i}: 1\n")).collect();
+        assert_eq!(
+            parse(&keys).expect_err("many"),
+            format!("sensor.yaml:{}: has too many keys", MAX_KEYS + 1)
         );
         let deep = parse(&"[".repeat(5000)).expect_err("deep");
         assert!(

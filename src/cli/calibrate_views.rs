@@ -3,7 +3,11 @@
 use super::Failure;
 use super::calibrate::Args;
 use crate::calibration::{Board, Lens, View, views_from_csv};
+use crate::text_file;
 use std::path::Path;
+
+/// Longest file of points that is read, bytes: a thousand views of a large board.
+const MAX_BYTES: u64 = 256 << 20;
 
 /// Views, and what is to be said of them.
 pub(super) struct Views {
@@ -21,8 +25,8 @@ pub(super) fn from_corners(
     size_px: Option<(u32, u32)>,
     board: &Board,
 ) -> Result<Views, Failure> {
-    let text = std::fs::read_to_string(file)
-        .map_err(|e| Failure::usage(format!("{}: cannot be read: {e}", file.display())))?;
+    let text = text_file::read(file, MAX_BYTES)
+        .map_err(|why| Failure::usage(format!("{}: {why}", file.display())))?;
     let views = views_from_csv(&text, board)
         .map_err(|e| Failure::usage(format!("{}:{e}", file.display())))?;
     let size_px = size_px.ok_or_else(|| Failure::usage("--size: is missing"))?;

@@ -1,5 +1,6 @@
 //! What is wrong with a file that was to be evaluated, and where.
 
+use crate::text_file;
 use std::path::{Path, PathBuf};
 
 /// What is wrong with a file, and where.
@@ -35,13 +36,10 @@ impl std::fmt::Display for FileError {
 
 impl std::error::Error for FileError {}
 
+/// Longest file that is evaluated, bytes: two hours of rows at a hundred a second.
+const MAX_BYTES: u64 = 1 << 30;
+
 /// Reads a whole text file.
 pub(super) fn read_text(path: &Path) -> Result<String, FileError> {
-    let bytes = std::fs::read(path)
-        .map_err(|e| FileError::new(path, None, format!("cannot be read: {e}")))?;
-    String::from_utf8(bytes).map_err(|e| {
-        let before = &e.as_bytes()[..e.utf8_error().valid_up_to()];
-        let line = before.iter().filter(|&&b| b == b'\n').count() + 1;
-        FileError::new(path, Some(line), "is not text in UTF-8")
-    })
+    text_file::read(path, MAX_BYTES).map_err(|fault| FileError::new(path, fault.line, fault.cause))
 }

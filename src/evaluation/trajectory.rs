@@ -1,6 +1,8 @@
 //! A trajectory file in KITTI, TUM or EuRoC form in, poses out.
 
 use super::file_error::{FileError, read_text};
+use crate::capture::MAX_STAMP_NS;
+use crate::text_file::shown;
 use nalgebra::{Isometry3, Matrix3, Quaternion, Translation3, UnitQuaternion, Vector3};
 use std::path::Path;
 
@@ -144,9 +146,12 @@ fn parse_line(form: Form, line: &str) -> Result<(Option<i64>, Isometry3<f64>), S
         Form::Euroc => {
             let [x, y, z, qw, qx, qy, qz] = numbers(line, 1, false)?;
             let first = first_field(line);
-            let stamp_ns = first
-                .parse()
-                .map_err(|_| format!("column 1 must be a time in whole ns, but is '{first}'"))?;
+            let stamp_ns = first.parse().ok().filter(is_stamp).ok_or_else(|| {
+                format!(
+                    "column 1 must be a time in whole ns, but is '{}'",
+                    shown(first)
+                )
+            })?;
             let pose = pose_of_quaternion([x, y, z], Quaternion::new(qw, qx, qy, qz))?;
             Ok((Some(stamp_ns), pose))
         }
@@ -174,11 +179,17 @@ fn numbers<const N: usize>(line: &str, skip: usize, all: bool) -> Result<[f64; N
     let mut values = [0.0; N];
     for (i, (value, field)) in values.iter_mut().zip(fields(line).skip(skip)).enumerate() {
         let column = skip + i + 1;
-        let number: f64 = field
-            .parse()
-            .map_err(|_| format!("column {column} must be a number, but is '{field}'"))?;
+        let number: f64 = field.parse().map_err(|_| {
+            format!(
+                "column {column} must be a number, but is '{}'",
+                shown(field)
+            )
+        })?;
         if !number.is_finite() {
-            return Err(format!("column {column} must be finite, but is {field}"));
+            return Err(format!(
+                "column {column} must be finite, but is {}",
+                shown(field)
+            ));
         }
         *value = number;
     }
@@ -187,7 +198,12 @@ fn numbers<const N: usize>(line: &str, skip: usize, all: bool) -> Result<[f64; N
 
 /// Seconds in decimal notation, exactly: an f64 of today's seconds has lost the nanoseconds.
 fn seconds_as_ns(text: &str) -> Result<i64, String> {
-    let fail = || format!("column 1 must be a time in seconds, but is '{text}'");
+    let fail = || {
+        format!(
+            "column 1 must be a time in seconds, but is '{}'",
+            shown(text)
+        )
+    };
     let (whole, fraction) = text.split_once('.').unwrap_or((text, ""));
     let digits = |s: &str| s.bytes().all(|b| b.is_ascii_digit());
     if digits(fraction) && !whole.is_empty() && digits(whole) {
@@ -201,15 +217,19 @@ fn seconds_as_ns(text: &str) -> Result<i64, String> {
         return whole
             .checked_mul(1_000_000_000)
             .and_then(|s| s.checked_add(ns))
+            .filter(is_stamp)
             .ok_or_else(fail);
     }
     let seconds: f64 = text.parse().map_err(|_| fail())?;
-    let ns = seconds * 1e9;
-    if ns.abs() < 9e18 {
-        Ok(ns.round() as i64)
-    } else {
-        Err(fail())
-    }
+    // What is too large for an integer becomes the largest, and not a number zero.
+    let ns = (seconds * 1e9).round() as i64;
+    Some(ns)
+        .filter(|ns| seconds.is_finite() && is_stamp(ns))
+        .ok_or_else(fail)
+}
+
+fn is_stamp(ns: &i64) -> bool {
+    ns.unsigned_abs() < MAX_STAMP_NS.unsigned_abs()
 }
 
 pub(super) fn pose_of_matrix(m: &[f64; 12]) -> Result<Isometry3<f64>, String> {

@@ -25,4 +25,7 @@ pub use distortion::Distortion;
 pub use plausibility::{Finding, Severity, check_rig};
 pub use rectification::Rectification;
 pub use rig::{RigUncertainty, StereoRig};
+pub(crate) use rig_file::save_rig;
+#[cfg(feature = "mcap")]
+pub(crate) use rig_file::{COVARIANCE_FILE, parse_rig_with_covariance, with_covariance_beside};
 pub use rig_file::{RigFileError, load_rig, parse_rig, rig_to_toml};

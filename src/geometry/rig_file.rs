@@ -1,11 +1,13 @@
 //! `rig.toml`: a rig as a file, read with every value checked, and written.
 
-use super::rig_parameters::read_rig_covariance;
+#[cfg(feature = "mcap")]
+use super::rig_parameters::parse_rig_covariance;
+use super::rig_parameters::{RigCovariance, read_rig_covariance, rig_covariance_to_csv};
 use super::{Camera, Distortion, RigUncertainty, StereoRig, so3};
 use crate::toml_file::{TomlError, TomlText};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
-use std::path::{Path, PathBuf};
+use std::path::{Component, Path, PathBuf};
 
 /// Why a rig file cannot be used.
 pub type RigFileError = TomlError;
@@ -79,6 +81,8 @@ struct UncertaintyTable {
     covariance: Option<PathBuf>,
 }
 
+/// The name of the covariance's file beside a rig that visod writes into a folder of its own.
+pub(crate) const COVARIANCE_FILE: &str = "rig.cov.csv";
 /// Longest image side that a rig may have, px.
 const MAX_SIDE_PX: u32 = 16_384;
 
@@ -89,18 +93,72 @@ const MAX_SIDE_PX: u32 = 16_384;
 /// have; with the line and the key where there is one.
 pub fn load_rig(path: &Path) -> Result<StereoRig, RigFileError> {
     let folder = path.parent().unwrap_or(Path::new(""));
-    checked(&TomlText::read(path)?, folder)
+    checked(&TomlText::read(path)?, &|rig, file| {
+        read_rig_covariance(rig, &folder.join(file))
+    })
 }
 
-/// Reads a rig from a text.
+/// Reads a rig from a text, beside which there is no file: its covariance cannot be one.
 ///
 /// # Errors
 /// As [`load_rig`].
 pub fn parse_rig(text: &str) -> Result<StereoRig, RigFileError> {
-    checked(&TomlText::new("rig", text), Path::new(""))
+    checked(&TomlText::new("rig", text), &|_, file| {
+        Err(format!(
+            "{}: is not at hand, as this rig comes from no file",
+            file.display()
+        ))
+    })
 }
 
-fn checked(text: &TomlText, folder: &Path) -> Result<StereoRig, RigFileError> {
+/// Reads a rig from a text, and the covariance whose file it names from another.
+///
+/// # Errors
+/// As [`load_rig`].
+#[cfg(feature = "mcap")]
+pub(crate) fn parse_rig_with_covariance(
+    text: &str,
+    covariance: &str,
+) -> Result<StereoRig, RigFileError> {
+    checked(&TomlText::new("rig", text), &|rig, _| {
+        parse_rig_covariance(rig, covariance)
+    })
+}
+
+/// Writes a rig into a folder of its own: `rig.toml`, and beside it the covariance, where one is known.
+///
+/// # Errors
+/// The file that cannot be written, and what the system said.
+pub(crate) fn save_rig(folder: &Path, rig: &StereoRig) -> Result<(), (PathBuf, std::io::Error)> {
+    let write = |name: &str, text: String| {
+        let file = folder.join(name);
+        std::fs::write(&file, text).map_err(|cause| (file, cause))
+    };
+    let (rig, covariance) = with_covariance_beside(rig);
+    if let Some(csv) = covariance {
+        write(COVARIANCE_FILE, csv)?;
+    }
+    write("rig.toml", rig_to_toml(&rig))
+}
+
+/// The rig as it is to be written with its covariance beside it in [`COVARIANCE_FILE`], and what that holds.
+pub(crate) fn with_covariance_beside(rig: &StereoRig) -> (StereoRig, Option<String>) {
+    let mut rig = rig.clone();
+    let csv = match &mut rig.uncertainty {
+        Some(RigUncertainty::Covariance { file, covariance }) => {
+            *file = COVARIANCE_FILE.into();
+            Some(covariance.clone())
+        }
+        _ => None,
+    };
+    let csv = csv.map(|covariance| rig_covariance_to_csv(&rig, &covariance));
+    (rig, csv)
+}
+
+/// Gives the covariance of a rig from the file that the rig names.
+type CovarianceOf<'a> = &'a dyn Fn(&StereoRig, &Path) -> Result<RigCovariance, String>;
+
+fn checked(text: &TomlText, covariance_of: CovarianceOf) -> Result<StereoRig, RigFileError> {
     let file: RigFile = text.parse()?;
     let finite = |key: &str, values: &[f64]| match values.iter().find(|v| !v.is_finite()) {
         Some(bad) => Err(text.wrong(key, format!("must be finite, but holds {bad}"))),
@@ -145,7 +203,7 @@ fn checked(text: &TomlText, folder: &Path) -> Result<StereoRig, RigFileError> {
         uncertainty: None,
     };
     if let Some(table) = &file.uncertainty {
-        rig.uncertainty = Some(uncertainty(text, &rig, table, folder)?);
+        rig.uncertainty = Some(uncertainty(text, &rig, table, covariance_of)?);
     }
     Ok(rig)
 }
@@ -155,7 +213,7 @@ fn uncertainty(
     text: &TomlText,
     rig: &StereoRig,
     table: &UncertaintyTable,
-    folder: &Path,
+    covariance_of: CovarianceOf,
 ) -> Result<RigUncertainty, RigFileError> {
     let sigmas = [
         ("focal_px", table.focal_px),
@@ -171,8 +229,18 @@ fn uncertainty(
                 "stands beside `covariance`, which holds all parameters: only one of the two may",
             ));
         }
-        let covariance = read_rig_covariance(rig, &folder.join(file))
-            .map_err(|cause| text.wrong(&key("covariance"), cause))?;
+        // Rigs come along with others' recordings, and must not name what else this machine holds.
+        let is_inside = file
+            .components()
+            .all(|c| matches!(c, Component::Normal(_) | Component::CurDir));
+        if !is_inside {
+            return Err(text.wrong(
+                &key("covariance"),
+                "must be a file in the folder of the rig file or below, without \"..\"",
+            ));
+        }
+        let covariance =
+            covariance_of(rig, file).map_err(|cause| text.wrong(&key("covariance"), cause))?;
         return Ok(RigUncertainty::Covariance {
             file: file.clone(),
             covariance: Box::new(covariance),
@@ -423,6 +491,51 @@ translation_m = 2e-4
             both.to_string().contains("only one of the two may"),
             "{both}"
         );
+    }
+
+    #[test]
+    fn a_rig_names_no_file_outside_its_folder() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let (head, _) = GOOD.split_once("[uncertainty]").expect("stated");
+        std::fs::write(folder.path().join("out.csv"), "tx\n4e-8\n").expect("written");
+        std::fs::create_dir(folder.path().join("rig")).expect("made");
+        let rig_file = folder.path().join("rig/rig.toml");
+        let outside = folder.path().join("out.csv");
+        for name in [
+            "../out.csv",
+            "rig/../../out.csv",
+            "",
+            outside.to_str().expect("text"),
+        ] {
+            let text = format!("{head}[uncertainty]\ncovariance = \"{name}\"\n");
+            std::fs::write(&rig_file, text).expect("written");
+            let why = load_rig(&rig_file).expect_err("outside").to_string();
+            let expected = if name.is_empty() {
+                "cannot be read"
+            } else {
+                "must be a file in the folder"
+            };
+            assert!(why.contains(expected), "{name}: {why}");
+        }
+    }
+
+    #[test]
+    fn a_rig_goes_into_a_folder_with_its_covariance() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let mut rig = parse_rig(GOOD).expect("valid");
+        let mut covariance = RigCovariance::zeros();
+        covariance[(24, 24)] = 4e-8;
+        rig.uncertainty = Some(RigUncertainty::Covariance {
+            file: "/somewhere/else.csv".into(),
+            covariance: Box::new(covariance),
+        });
+        save_rig(folder.path(), &rig).expect("written");
+        let again = load_rig(&folder.path().join("rig.toml")).expect("valid");
+        assert_eq!(again.covariance(), Some(covariance));
+        let alone = parse_rig(&rig_to_toml(&again))
+            .expect_err("no file")
+            .to_string();
+        assert!(alone.contains("rig.cov.csv: is not at hand"), "{alone}");
     }
 
     #[test]

@@ -6,6 +6,7 @@
 //! `exp(r) · R`, a turn about the right camera's axes.
 
 use super::{Camera, Distortion, RigUncertainty, StereoRig, so3};
+use crate::text_file::{self, shown};
 use nalgebra::{Isometry3, SMatrix, SVector, Translation3, Vector2};
 use std::path::Path;
 
@@ -149,15 +150,9 @@ const MAX_BYTES: u64 = 1 << 20;
 /// One sentence: the file cannot be read, names a parameter that the rig has not, or does not hold
 /// a covariance.
 pub fn read_rig_covariance(rig: &StereoRig, path: &Path) -> Result<RigCovariance, String> {
-    let fail = |cause: String| format!("{}: {cause}", path.display());
-    let size = std::fs::metadata(path)
-        .map_err(|e| fail(format!("cannot be read: {e}")))?
-        .len();
-    if size > MAX_BYTES {
-        return Err(fail(format!("has {size} bytes, more than {MAX_BYTES}")));
-    }
-    let text = std::fs::read_to_string(path).map_err(|e| fail(format!("cannot be read: {e}")))?;
-    parse_rig_covariance(rig, &text).map_err(fail)
+    let text = text_file::read(path, MAX_BYTES).map_err(|fault| fault.to_string());
+    text.and_then(|text| parse_rig_covariance(rig, &text))
+        .map_err(|cause| format!("{}: {cause}", path.display()))
 }
 
 /// As [`read_rig_covariance`], from a text.
@@ -172,7 +167,10 @@ pub fn parse_rig_covariance(rig: &StereoRig, text: &str) -> Result<RigCovariance
     for name in header.split(',').map(str::trim) {
         let slot = known.iter().find(|(known, _)| known == name);
         let Some((_, slot)) = slot else {
-            return Err(format!("1: {name:?} is no parameter of this rig"));
+            return Err(format!(
+                "1: \"{}\" is no parameter of this rig",
+                shown(name)
+            ));
         };
         if slots.contains(slot) {
             return Err(format!("1: {name:?} is named twice"));
@@ -194,7 +192,10 @@ pub fn parse_rig_covariance(rig: &StereoRig, text: &str) -> Result<RigCovariance
         for (number, j) in numbers.iter().zip(&slots) {
             covariance[(*i, *j)] = match number.parse::<f64>() {
                 Ok(value) if value.is_finite() => value,
-                _ => return Err(format!("row {rows} holds {number:?}, which is no number")),
+                _ => {
+                    let shown = shown(number);
+                    return Err(format!("row {rows} holds \"{shown}\", which is no number"));
+                }
             };
         }
     }

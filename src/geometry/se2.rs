@@ -66,6 +66,21 @@ mod tests {
         }
 
         #[test]
+        fn the_adjoint_keeps_products_and_inverses(a in any_twist(), b in any_twist()) {
+            let (s, t) = (exp(&a), exp(&b));
+            let product = adjoint(&s) * adjoint(&t);
+            prop_assert!((adjoint(&(s * t)) - product).norm() < 1e-13 * product.norm());
+            let whole = adjoint(&s) * adjoint(&s.inverse());
+            prop_assert!((whole - Matrix3::identity()).norm() < 1e-13 * adjoint(&s).norm_squared());
+        }
+
+        #[test]
+        fn exp_of_the_opposite_is_the_inverse(xi in any_twist()) {
+            let gap = exp(&-xi).to_homogeneous() - exp(&xi).inverse().to_homogeneous();
+            prop_assert!(gap.norm() < 1e-12 * (1.0 + xi.norm()));
+        }
+
+        #[test]
         fn exp_of_a_sum_along_one_twist_is_the_product(xi in any_twist(), s in 0.0..1.0_f64) {
             let product = exp(&(xi * s)) * exp(&(xi * (1.0 - s)));
             prop_assert!((product.to_homogeneous() - exp(&xi).to_homogeneous()).norm() < 1e-12);

@@ -163,6 +163,44 @@ mod tests {
         }
 
         #[test]
+        fn the_adjoint_keeps_products_and_inverses(a in any_twist(), b in any_twist()) {
+            let (s, t) = (exp(&a), exp(&b));
+            let product = adjoint(&s) * adjoint(&t);
+            prop_assert!((adjoint(&(s * t)) - product).norm() < 1e-13 * product.norm());
+            let whole = adjoint(&s) * adjoint(&s.inverse());
+            prop_assert!((whole - Matrix6::identity()).norm() < 1e-13 * adjoint(&s).norm_squared());
+        }
+
+        #[test]
+        fn exp_of_the_opposite_is_the_inverse(xi in any_twist()) {
+            let gap = exp(&-xi).to_matrix() - exp(&xi).inverse().to_matrix();
+            prop_assert!(gap.norm() < 1e-14 * (1.0 + xi.norm()));
+        }
+
+        #[test]
+        fn motions_form_a_group(a in any_twist(), b in any_twist(), c in any_twist()) {
+            let (r, s, t) = (exp(&a), exp(&b), exp(&c));
+            let gap = ((r * s) * t).to_matrix() - (r * (s * t)).to_matrix();
+            prop_assert!(gap.norm() < 1e-13 * (1.0 + a.norm() + b.norm() + c.norm()));
+            let back = (t.inverse() * (t * r)).to_matrix() - r.to_matrix();
+            prop_assert!(back.norm() < 1e-13 * (1.0 + a.norm() + c.norm()));
+        }
+
+        #[test]
+        fn a_covariance_changes_axes_there_and_back_and_stays_one(
+            a in any_twist(),
+            root in prop::collection::vec(-1.0..1.0_f64, 36),
+        ) {
+            let t = exp(&a);
+            let root = Matrix6::from_column_slice(&root);
+            let cov = root * root.transpose() + Matrix6::identity() * 1e-3;
+            let fixed = cov_fixed_axes_from_right(&t, &cov);
+            prop_assert!(symmetric(&fixed).cholesky().is_some());
+            let back = cov_right_from_fixed_axes(&t, &fixed);
+            prop_assert!((back - cov).norm() < 1e-13 * cov.norm());
+        }
+
+        #[test]
         fn right_jacobian_inverse_is_the_derivative_of_log(a in any_twist()) {
             let xi = a * (0.7 / a.norm().max(0.7));
             let exact = right_jacobian_inverse(&xi);

@@ -123,6 +123,19 @@ mod tests {
         }
 
         #[test]
+        fn exp_of_the_opposite_is_the_inverse(phi in any_vector(3.1)) {
+            let gap = exp(&-phi).coords - exp(&phi).inverse().coords;
+            prop_assert!(gap.norm() < 1e-15);
+        }
+
+        /// J(−φ) is the Jacobian of the other side, R(φ)ᵀ J(φ).
+        #[test]
+        fn the_jacobian_of_the_opposite_is_that_of_the_other_side(phi in any_vector(3.1)) {
+            let other = exp(&phi).to_rotation_matrix().into_inner().transpose() * left_jacobian(&phi);
+            prop_assert!((left_jacobian(&-phi) - other).norm() < 1e-14);
+        }
+
+        #[test]
         fn inverse_jacobian_is_the_inverse(phi in any_vector(3.1)) {
             let product = left_jacobian(&phi) * left_jacobian_inverse(&phi);
             prop_assert!((product - Matrix3::identity()).norm() < 1e-14);

@@ -6,7 +6,9 @@
 
 use super::number::push_f64;
 use super::row::{OdometryRow, Value, from_upper_triangle, isometry};
+use crate::capture::MAX_STAMP_NS;
 use crate::estimation::{Counts, Odometry, Status};
+use crate::text_file::shown;
 use std::fmt::Write as _;
 use std::fs::File;
 use std::io::{self, BufWriter, Read, Write};
@@ -152,18 +154,27 @@ impl std::fmt::Display for CsvError {
 
 impl std::error::Error for CsvError {}
 
+/// Longest file that is read, bytes: two hours of rows at a hundred a second.
+const MAX_BYTES: u64 = 1 << 30;
+
 /// Reads an odometry CSV. Columns are found by name, so more may be there, in any order.
 ///
 /// # Errors
 /// [`CsvError`]: the file cannot be read, lacks a column, or holds a value that cannot be.
 pub fn read_odometry_csv(path: &Path) -> Result<Vec<OdometryRow>, CsvError> {
-    let file = File::open(path).map_err(|e| CsvError {
+    let wrong = |cause| CsvError {
         file: path.to_owned(),
         line: None,
         column: None,
-        cause: format!("cannot be read: {e}"),
-    })?;
-    parse_odometry_csv(path, file)
+        cause,
+    };
+    let file = File::open(path).map_err(|e| wrong(format!("cannot be read: {e}")))?;
+    let length = file.metadata().map_or(0, |meta| meta.len());
+    if length > MAX_BYTES {
+        return Err(wrong(format!("has {length} bytes, more than {MAX_BYTES}")));
+    }
+    // What is no file has no length, and perhaps no end.
+    parse_odometry_csv(path, file.take(MAX_BYTES))
 }
 
 /// Reads an odometry CSV from anywhere, under a name for messages.
@@ -244,7 +255,7 @@ impl Record<'_> {
         let latency_ms: f64 = self.number(65)?;
         Ok(OdometryRow {
             sequence: self.parse(0, "a whole number")?,
-            timestamp_ns: self.parse(1, "a whole number of nanoseconds")?,
+            timestamp_ns: self.stamp_ns(1)?,
             status: self.status(2)?,
             odom_from_camera: self.pose(3)?,
             cov_pose: from_upper_triangle(&self.finite_numbers(10)?),
@@ -287,8 +298,21 @@ impl Record<'_> {
 
     fn parse<T: std::str::FromStr>(&self, column: usize, what: &str) -> Result<T, CsvError> {
         let text = self.text(column);
-        text.parse()
-            .map_err(|_| self.wrong(Some(column), format!("must be {what}, but is '{text}'")))
+        text.parse().map_err(|_| {
+            self.wrong(
+                Some(column),
+                format!("must be {what}, but is '{}'", shown(text)),
+            )
+        })
+    }
+
+    fn stamp_ns(&self, column: usize) -> Result<i64, CsvError> {
+        let ns: i64 = self.parse(column, "a whole number of nanoseconds")?;
+        if ns.unsigned_abs() < MAX_STAMP_NS.unsigned_abs() {
+            return Ok(ns);
+        }
+        let cause = format!("must lie within ±{MAX_STAMP_NS} ns, but is {ns}");
+        Err(self.wrong(Some(column), cause))
     }
 
     /// Any number, `nan` and infinities included.
@@ -327,7 +351,10 @@ impl Record<'_> {
             "lost" => Ok(Status::Lost),
             other => Err(self.wrong(
                 Some(column),
-                format!("must be initializing, tracking, degraded or lost, but is '{other}'"),
+                format!(
+                    "must be initializing, tracking, degraded or lost, but is '{}'",
+                    shown(other)
+                ),
             )),
         }
     }

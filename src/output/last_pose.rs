@@ -7,6 +7,7 @@
 
 use crate::estimation::{Odometry, Start, Status};
 use crate::settings::SettingError;
+use crate::text_file;
 use nalgebra::{Isometry3, Matrix6, Quaternion, Translation3, UnitQuaternion, Vector3};
 use serde::{Deserialize, Serialize};
 use std::fs::File;
@@ -190,9 +191,15 @@ impl Legacy {
     }
 }
 
+/// Longest file that is read, bytes: one pose has two thousand.
+const MAX_BYTES: u64 = 1 << 16;
+
 fn load(file: &Path) -> io::Result<Kept> {
-    let text = std::fs::read_to_string(file)?;
     let damaged = |cause: String| io::Error::new(io::ErrorKind::InvalidData, cause);
+    let text = text_file::read(file, MAX_BYTES).map_err(|fault| {
+        let kind = fault.kind.unwrap_or(io::ErrorKind::InvalidData);
+        io::Error::new(kind, fault.to_string())
+    })?;
     // The parser's further lines show the place, which nobody has typed.
     let kept: Kept = toml::from_str(&text)
         .map_err(|e| damaged(format!("it is damaged: {}", e.message().trim_end())))?;
@@ -218,7 +225,7 @@ fn restore(
         return Ok(None);
     };
     let (odom_from_camera, cov_pose) = pose.checked()?;
-    let age_s = (realtime_ns - pose.realtime_ns) as f64 * 1e-9;
+    let age_s = realtime_ns.saturating_sub(pose.realtime_ns) as f64 * 1e-9;
     if age_s < 0.0 {
         return Err(format!(
             "it lies {:.0} s in the future: the clock has been set",

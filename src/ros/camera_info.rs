@@ -127,7 +127,13 @@ fn rotation(info: &CameraInfo) -> Result<Rotation3<f64>, String> {
     if !(fault < MAX_ROTATION_FAULT && m.determinant() > 0.0) {
         return Err("r is no rotation".to_owned());
     }
-    Ok(Rotation3::from_matrix(&m))
+    // Without a limit to its iterations the search for the nearest one need not end.
+    Ok(Rotation3::from_matrix_eps(
+        &m,
+        1e-15,
+        100,
+        Rotation3::identity(),
+    ))
 }
 
 /// The calibrations of a rig's cameras, without header. `None` if the rig cannot be rectified.

@@ -1,5 +1,6 @@
 //! Priorities, processors and memory that stays, asked for from the kernel. What it refuses is a reason
 //! for a warning, never for an end.
+#![expect(unsafe_code, reason = "calls of the system")]
 
 use rustix::mm::{MlockAllFlags, mlockall};
 use rustix::thread::{CpuSet, sched_setaffinity};

@@ -4,7 +4,7 @@
 //! `poses.txt` (the upper three rows of each pose's matrix, row by row, as KITTI has them).
 
 use crate::capture::StereoPair;
-use crate::geometry::{StereoRig, rig_to_toml};
+use crate::geometry::{StereoRig, save_rig};
 use crate::image::GrayImage;
 use image::codecs::png::{CompressionType, FilterType, PngEncoder};
 use image::{ExtendedColorType, ImageEncoder};
@@ -70,7 +70,7 @@ impl DatasetWriter {
             times: String::new(),
             poses: String::new(),
         };
-        writer.write("rig.toml", rig_to_toml(rig).as_bytes())?;
+        save_rig(folder, rig).map_err(|(file, cause)| DatasetError::Write { file, cause })?;
         Ok(writer)
     }
 

@@ -4,6 +4,10 @@
 //! The cameras expose together, at whole multiples of their period: number n of the recording is what
 //! both send at tick n after the first at which both are running. The stamps are the recording's, on
 //! clocks that may differ.
+#![expect(
+    unsafe_code,
+    reason = "calls of Aravis for which its crate has no form"
+)]
 
 use crate::capture::camera::monotonic_ns;
 use crate::capture::{Dataset, PairEvent, PairSource, ReadAhead, Side};

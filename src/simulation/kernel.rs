@@ -1,5 +1,9 @@
 //! A patch of texels and a kernel's place on it in, their weighted mean out: where rendering spends
 //! its time, and so for the processor's widest registers.
+#![cfg_attr(
+    target_arch = "x86_64",
+    expect(unsafe_code, reason = "registers of AVX2")
+)]
 
 /// Texels handled at once.
 pub(super) const LANES: usize = 8;

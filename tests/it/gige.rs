@@ -2,6 +2,10 @@
 //!
 //! Each test runs in a network namespace of its own, made by `unshare`, where discovery reaches nobody
 //! else. Where that is not allowed, the tests say so and pass over.
+#![expect(
+    unsafe_code,
+    reason = "what a process does before it becomes the program"
+)]
 
 use super::one_camera::{assert_camera_conforms, assert_leaves, assert_unsuitable};
 use super::publication::System;

@@ -12,6 +12,10 @@ mod c_header;
 #[cfg(test)]
 mod calibrate;
 #[cfg(test)]
+mod corpora;
+#[cfg(test)]
+mod cuts;
+#[cfg(test)]
 mod evaluate;
 #[cfg(test)]
 mod features;
@@ -59,6 +63,8 @@ mod scenarios;
 #[cfg(test)]
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod service;
+#[cfg(test)]
+mod supply_chain;
 #[cfg(test)]
 #[cfg(feature = "v4l")]
 mod v4l2;

@@ -5,6 +5,7 @@ use super::numbers::{
 };
 use crate::capture::yaml::{Node, Value, YamlFile};
 use crate::geometry::{Camera, Distortion, StereoRig};
+use crate::text_file::shown;
 use std::fmt::Write as _;
 use std::path::Path;
 
@@ -42,7 +43,7 @@ fn one(yaml: &YamlFile, node: &Node) -> Result<Camera, String> {
             .wrong(
                 need("camera_model")?,
                 "camera_model",
-                format!("only \"pinhole\" is read, but it is {model:?}"),
+                format!("only \"pinhole\" is read, but it is \"{}\"", shown(&model)),
             )
             .to_string());
     }

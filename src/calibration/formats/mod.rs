@@ -21,6 +21,7 @@ mod numbers;
 mod opencv;
 mod ros;
 
+use crate::capture::text::read_calibration;
 use crate::geometry::{StereoRig, load_rig, rig_to_toml};
 use std::path::{Path, PathBuf};
 
@@ -226,16 +227,7 @@ pub fn export(rig: &StereoRig, format: Format) -> Result<Vec<Exported>, String> 
 }
 
 fn read(file: &Path) -> Result<String, String> {
-    const MOST_BYTES: u64 = 16 << 20;
-    let fail = |e: &dyn std::fmt::Display| format!("{}: cannot be read: {e}", file.display());
-    let size = std::fs::metadata(file).map_err(|e| fail(&e))?.len();
-    if size > MOST_BYTES {
-        return Err(format!(
-            "{}: has {size} bytes, more than {MOST_BYTES}",
-            file.display()
-        ));
-    }
-    std::fs::read_to_string(file).map_err(|e| fail(&e))
+    read_calibration(file).map_err(|e| e.to_string())
 }
 
 #[cfg(test)]

@@ -3,6 +3,7 @@
 use crate::capture::yaml::{Node, YamlFile};
 use crate::geometry::rig_parameters::EXTRINSICS;
 use crate::geometry::{Camera, Distortion, RigUncertainty, StereoRig};
+use crate::text_file::shown;
 use nalgebra::{Isometry3, Matrix3, Rotation3, Translation3, UnitQuaternion, Vector2, Vector3};
 
 /// Farthest that a matrix stated as a rotation may be from one: files with four digits pass.
@@ -112,7 +113,7 @@ pub(super) fn lens(model: &str, coefficients: &[f64]) -> Result<Distortion, Stri
                     coefficients.len()
                 )
             }),
-        other => Err(format!("a lens model {other:?} is not known")),
+        other => Err(format!("a lens model \"{}\" is not known", shown(other))),
     }
 }
 

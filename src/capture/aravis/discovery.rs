@@ -1,4 +1,8 @@
 //! Which cameras Aravis sees, and opening one by what its owner calls it.
+#![expect(
+    unsafe_code,
+    reason = "calls of Aravis for which its crate has no form"
+)]
 
 use crate::capture::camera::CameraError;
 use aravis::Camera;

@@ -1,4 +1,5 @@
 //! Memory that a camera's driver writes images to, and that leaves as images without being copied.
+#![expect(unsafe_code, reason = "memory that Aravis fills")]
 
 use crate::image::GrayImage;
 use aravis::Buffer;

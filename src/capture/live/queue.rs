@@ -66,16 +66,122 @@ impl Queue {
             Some(event)
         } else {
             self.events.push_back(event);
-            let oldest = self.events.iter().position(is_pair);
-            oldest.and_then(|at| self.events.remove(at))
+            self.pop_oldest_pair()
         };
         match dropped {
             Some(PairEvent::Pair(pair)) => Some(pair),
             _ => None,
         }
     }
+    /// Takes the oldest pair out. What stood before and behind it may now be events without images in a row.
+    fn pop_oldest_pair(&mut self) -> Option<PairEvent> {
+        let at = self.events.iter().position(is_pair)?;
+        let pair = self.events.remove(at);
+        if at > 0 && self.events.get(at).is_some_and(|next| !is_pair(next)) {
+            self.events.remove(at - 1);
+        }
+        pair
+    }
 }
 
 fn is_pair(event: &PairEvent) -> bool {
     matches!(event, PairEvent::Pair(_))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::capture::{Skew, Unusable};
+    use crate::image::GrayImage;
+    use proptest::prelude::*;
+
+    fn pair(sequence: u64) -> PairEvent {
+        PairEvent::Pair(StereoPair {
+            sequence,
+            timestamp_ns: 0,
+            skew: Skew::default(),
+            left: GrayImage::default(),
+            right: GrayImage::default(),
+        })
+    }
+
+    fn none(sequence: u64) -> PairEvent {
+        PairEvent::Unusable(Unusable {
+            sequence,
+            timestamp_ns: None,
+            why: "silence".to_owned(),
+        })
+    }
+
+    fn number(event: &PairEvent) -> u64 {
+        match event {
+            PairEvent::Pair(pair) => pair.sequence,
+            PairEvent::Unusable(unusable) => unusable.sequence,
+        }
+    }
+
+    /// What happens to a queue.
+    #[derive(Clone, Copy, Debug)]
+    enum Step {
+        Pair,
+        NoPair,
+        Pop,
+    }
+
+    proptest! {
+        /// Whatever the schedule of the cameras' side and the stages' side: no more pairs wait than may, each
+        /// comes out once or is dropped once, in order, and the right one is dropped.
+        #[test]
+        fn every_pair_is_handed_on_or_dropped_once_under_any_schedule(
+            steps in prop::collection::vec(
+                prop_oneof![Just(Step::Pair), Just(Step::NoPair), Just(Step::Pop)],
+                0..200,
+            ),
+            room in 1..5_usize,
+            keeps_oldest in any::<bool>(),
+        ) {
+            let overflow = if keeps_oldest { Overflow::Newest } else { Overflow::Oldest };
+            let mut queue = Queue::new(Delivery { queue: room, overflow, keeps_journal: false });
+            let (mut handed_on, mut dropped, mut waiting) = (Vec::new(), Vec::new(), Vec::new());
+            let mut next = 0;
+            for step in steps {
+                match step {
+                    Step::Pop => {
+                        let event = queue.pop();
+                        if let Some(event) = &event
+                            && is_pair(event)
+                        {
+                            prop_assert_eq!(number(event), waiting.remove(0));
+                        }
+                        handed_on.extend(event);
+                    }
+                    Step::NoPair => {
+                        prop_assert!(queue.push(none(next)).is_none());
+                        next += 1;
+                    }
+                    Step::Pair => {
+                        let was_full = waiting.len() == room;
+                        let out = queue.push(pair(next)).map(|pair| pair.sequence);
+                        waiting.push(next);
+                        let expected = was_full.then(|| match overflow {
+                            Overflow::Oldest => waiting.remove(0),
+                            Overflow::Newest => waiting.remove(room),
+                        });
+                        prop_assert_eq!(out, expected);
+                        dropped.extend(out);
+                        next += 1;
+                    }
+                }
+                prop_assert!(queue.pairs() <= room);
+                prop_assert_eq!(queue.pairs(), waiting.len());
+                // Between two pairs stands one event at most that is none.
+                prop_assert!(queue.events.len() <= 2 * queue.pairs() + 1);
+            }
+            handed_on.extend(std::iter::from_fn(|| queue.pop()));
+            let numbers: Vec<u64> = handed_on.iter().map(number).collect();
+            prop_assert!(numbers.windows(2).all(|two| two[0] < two[1]), "{numbers:?}");
+            let on: Vec<u64> = handed_on.iter().filter(|e| is_pair(e)).map(number).collect();
+            prop_assert!(dropped.iter().all(|n| !on.contains(n)));
+        }
+    }
 }

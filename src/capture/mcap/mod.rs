@@ -14,15 +14,19 @@ pub use source::McapSource;
 pub use topics::ImageTopic;
 
 use super::dataset::{DatasetError, Settings};
-use crate::geometry::{StereoRig, parse_rig};
+use crate::geometry::{COVARIANCE_FILE, StereoRig, parse_rig, parse_rig_with_covariance};
 use crate::ros::camera_info::{self, Calibration};
 use crate::ros::messages::CameraInfo;
 use crate::ros::{self, RIG_ATTACHMENT};
+use crate::toml_file::MAX_BYTES as MAX_ATTACHMENT_BYTES;
 use mcap::records::Record;
 use records::Records;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use topics::Topics;
+
+/// Longest calibration message that is looked at, bytes; the usual ones have a few hundred.
+const MAX_CALIBRATION_BYTES: usize = 1 << 16;
 
 /// A recording in an MCAP file.
 #[derive(Clone, Debug)]
@@ -78,6 +82,7 @@ struct Found {
     /// Calibrations by topic.
     infos: BTreeMap<String, CameraInfo>,
     attached_rig: Option<String>,
+    attached_covariance: Option<String>,
 }
 
 impl Found {
@@ -102,14 +107,22 @@ impl Found {
         match record {
             Record::Schema { header, .. } => self.topics.add_schema(header.id, &header.name),
             Record::Channel(channel) => self.topics.add_channel(channel),
-            Record::Attachment { header, data, .. } if header.name == RIG_ATTACHMENT => {
-                self.attached_rig = String::from_utf8(data.into_owned()).ok();
+            Record::Attachment { header, data, .. }
+                if data.len() as u64 <= MAX_ATTACHMENT_BYTES =>
+            {
+                let text = || String::from_utf8(data.into_owned()).ok();
+                match header.name.as_str() {
+                    RIG_ATTACHMENT => self.attached_rig = text(),
+                    COVARIANCE_FILE => self.attached_covariance = text(),
+                    _ => {}
+                }
             }
             Record::Message { header, data } => {
                 let Some(topic) = self.topics.camera_info(header.channel_id) else {
                     return;
                 };
-                if !self.infos.contains_key(topic)
+                if data.len() <= MAX_CALIBRATION_BYTES
+                    && !self.infos.contains_key(topic)
                     && let Ok(info) = ros::decode(&data)
                 {
                     self.infos.insert(topic.to_owned(), info);
@@ -136,7 +149,11 @@ impl Found {
 
     fn rig(&self, file: &Path, topics: &[ImageTopic; 2]) -> Result<StereoRig, DatasetError> {
         if let Some(text) = &self.attached_rig {
-            return parse_rig(text).map_err(|e| {
+            let rig = match &self.attached_covariance {
+                Some(covariance) => parse_rig_with_covariance(text, covariance),
+                None => parse_rig(text),
+            };
+            return rig.map_err(|e| {
                 DatasetError::file(file, format!("its attachment {RIG_ATTACHMENT}: {e}"))
             });
         }

@@ -1,13 +1,18 @@
 //! An MCAP file in; its records out, front to back, one at a time.
 
+use crate::text_file::one_line;
 use mcap::records::Record;
 use mcap::sans_io::{LinearReadEvent, LinearReader, LinearReaderOptions};
 use std::fs::File;
 use std::io::{Read, Seek};
 use std::path::Path;
 
-/// Longest record that is read, bytes: an image of the largest size, and the chunk around it.
-const MAX_RECORD_BYTES: usize = 1 << 30;
+/// Longest record that is read, bytes: an image of the largest size, and what stands around it.
+const MAX_RECORD_BYTES: u64 = 1 << 30;
+/// Longest record that a file may hold that is short itself, bytes: chunks may be compressed.
+const MAX_RECORD_OF_SHORT_FILE_BYTES: u64 = 64 << 20;
+/// What is asked of the system at once, bytes, so that a length that is not true takes no memory.
+const PIECE_BYTES: usize = 1 << 20;
 
 /// Reads records.
 pub(super) struct Records {
@@ -26,9 +31,11 @@ impl Records {
             return Err("is not a folder with a recording, and no MCAP file either".to_owned());
         }
         file.rewind().map_err(unreadable)?;
+        let length = file.metadata().map_err(unreadable)?.len();
+        let limit = length.clamp(MAX_RECORD_OF_SHORT_FILE_BYTES, MAX_RECORD_BYTES);
         let options = LinearReaderOptions::default()
             .with_validate_chunk_crcs(true)
-            .with_record_length_limit(MAX_RECORD_BYTES);
+            .with_record_length_limit(usize::try_from(limit).unwrap_or(usize::MAX));
         Ok(Self {
             file,
             reader: LinearReader::new_with_options(options),
@@ -48,7 +55,7 @@ impl Records {
                 LinearReadEvent::ReadRequest(need) => {
                     let read = self
                         .file
-                        .read(self.reader.insert(need))
+                        .read(self.reader.insert(need.min(PIECE_BYTES)))
                         .map_err(|e| format!("cannot be read: {e}"))?;
                     self.reader.notify_read(read);
                 }
@@ -69,6 +76,6 @@ fn sentence(error: &mcap::McapError) -> String {
         | mcap::McapError::UnexpectedEoc => {
             "ends in the middle of a record: it was cut off".to_owned()
         }
-        other => format!("is damaged: {other}"),
+        other => format!("is damaged: {}", one_line(&other.to_string(), 200)),
     }
 }

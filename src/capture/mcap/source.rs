@@ -3,7 +3,7 @@
 use super::images::Images;
 use super::records::Records;
 use super::{ImageTopic, McapRecording};
-use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
+use crate::capture::{MAX_STAMP_NS, PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::image::GrayImage;
 use crate::ros::messages::{CompressedImage, Header, Image};
 use crate::ros::{self, CdrError};
@@ -67,12 +67,18 @@ impl McapSource {
         };
         let topics = &self.topics;
         let waiting = &mut self.waiting;
+        let most_bytes = self.sizes_px.map(most_bytes_of);
         let more = records.next(|record| {
             if let Record::Message { header, data } = record
                 && let Some(side) = topics.iter().position(|t| t.channel == header.channel_id)
             {
                 let is_compressed = topics[side].is_compressed;
-                waiting[side].push_back(waiting_of(&data, is_compressed, header.log_time));
+                let most_bytes = most_bytes[side];
+                waiting[side].push_back(if data.len() > most_bytes {
+                    too_long(&data, most_bytes, header.log_time)
+                } else {
+                    waiting_of(&data, is_compressed, header.log_time)
+                });
             }
         });
         match more {
@@ -211,6 +217,22 @@ fn waiting_of(data: &[u8], is_compressed: bool, log_time_ns: u64) -> Waiting {
     }
 }
 
+/// Longest message with an image of this size, bytes. Of pixels in any encoding, or of a file that makes them no
+/// shorter, and what stands around them; so many may wait.
+fn most_bytes_of((width, height): (u32, u32)) -> usize {
+    8 * width as usize * height as usize + (1 << 16)
+}
+
+fn too_long(data: &[u8], most_bytes: usize, log_time_ns: u64) -> Waiting {
+    Waiting {
+        timestamp_ns: stamp_of_damaged(data, log_time_ns),
+        content: Err(format!(
+            "the message has {} bytes, more than the {most_bytes} that an image of the rig's size may have",
+            data.len()
+        )),
+    }
+}
+
 fn stamp(header: &Header) -> i64 {
     ros::timestamp_ns(header.stamp)
 }
@@ -219,7 +241,7 @@ fn stamp(header: &Header) -> i64 {
 fn stamp_of_damaged(data: &[u8], log_time_ns: u64) -> i64 {
     let header: Result<Header, CdrError> = ros::decode(data);
     header.map_or_else(
-        |_| i64::try_from(log_time_ns).unwrap_or(i64::MAX),
+        |_| i64::try_from(log_time_ns).map_or(MAX_STAMP_NS, |ns| ns.min(MAX_STAMP_NS)),
         |h| stamp(&h),
     )
 }

@@ -51,6 +51,18 @@ impl ImageTopic {
     }
 }
 
+/// Most topics with images or calibrations that are looked at.
+const MAX_TOPICS: usize = 256;
+/// Most that are named in a message.
+const MAX_NAMED: usize = 8;
+/// Longest name, bytes: ROS takes none that is longer.
+const MAX_NAME_BYTES: usize = 255;
+
+/// Whether ROS could name anything so.
+fn is_a_name(name: &str) -> bool {
+    name.len() <= MAX_NAME_BYTES && !name.contains(char::is_control)
+}
+
 /// What is known of a recording's topics.
 #[derive(Default)]
 pub(super) struct Topics {
@@ -65,11 +77,16 @@ impl Topics {
     }
 
     pub(super) fn add_schema(&mut self, id: u16, name: &str) {
-        self.schemas.insert(id, name.to_owned());
+        if is_a_name(name) {
+            self.schemas.insert(id, name.to_owned());
+        }
     }
 
     pub(super) fn add_channel(&mut self, channel: Channel) {
-        if channel.message_encoding != "cdr" {
+        if channel.message_encoding != "cdr"
+            || !is_a_name(&channel.topic)
+            || self.images.len() + self.camera_infos.len() >= MAX_TOPICS
+        {
             return;
         }
         let Some(schema) = self.schemas.get(&channel.schema_id) else {
@@ -133,6 +150,9 @@ impl Topics {
         let names: Vec<&str> = self.images.values().map(|t| t.name.as_str()).collect();
         let there = match names.as_slice() {
             [] => "it has none".to_owned(),
+            [names @ .., _] if names.len() >= MAX_NAMED => {
+                format!("it has {} and others", names[..MAX_NAMED].join(", "))
+            }
             names => format!("it has {}", names.join(", ")),
         };
         let cause = match wanted {
@@ -199,6 +219,18 @@ mod tests {
             );
             assert_eq!(chosen(&[(left, true), (right, true)]), Ok(expected));
         }
+    }
+
+    #[test]
+    fn names_that_ros_does_not_take_and_topics_without_end_are_passed_over() {
+        let long = format!("/left/{}", "x".repeat(MAX_NAME_BYTES));
+        let there = chosen(&[(&long, false), ("/left/\x1b[2J", false)]);
+        assert!(there.expect_err("none").contains("it has none"));
+        let names: Vec<String> = (0..2 * MAX_TOPICS).map(|n| format!("/{n}/image")).collect();
+        let many: Vec<(&str, bool)> = names.iter().map(|name| (name.as_str(), false)).collect();
+        assert_eq!(topics(&many).images.len(), MAX_TOPICS);
+        let why = chosen(&many).expect_err("no side is named");
+        assert!(why.len() < 400 && why.contains("and others"), "{why}");
     }
 
     #[test]

@@ -1,4 +1,5 @@
 //! A video device in; its buffers, mapped into this process, one after the other out.
+#![expect(unsafe_code, reason = "calls of the kernel, and memory shared with it")]
 
 use std::io;
 use std::sync::Arc;

@@ -1,7 +1,7 @@
 //! The file: channels, what goes on them, and when it is on the disk.
 
 use crate::estimation::{Odometry, TrackedFeature};
-use crate::geometry::{StereoRig, rig_to_toml};
+use crate::geometry::{COVARIANCE_FILE, StereoRig, rig_to_toml, with_covariance_beside};
 use crate::image::GrayImage;
 use crate::output::topics::{Audience, Purpose, Topic, Topics};
 use crate::ros::RIG_ATTACHMENT;
@@ -11,8 +11,8 @@ use std::borrow::Cow;
 use std::collections::BTreeMap;
 use std::io::{self, Seek, Write};
 
-/// Writes a recording; [`finish`](Self::finish) says whether all of it arrived. Without, what was
-/// written can be read up to the last second, in which diagnostics came.
+/// Writes a recording; [`finish`](Self::finish) says whether all of it arrived. Without, and wherever the file is
+/// cut, every pair that was added before can be read.
 pub struct McapWriter<W: Write + Seek> {
     topics: Topics,
     channels: Channels<W>,
@@ -40,15 +40,13 @@ impl<W: Write + Seek> McapWriter<W> {
             .library(concat!("visod ", env!("CARGO_PKG_VERSION")))
             .create(out)
             .map_err(io_error)?;
-        let toml = rig_to_toml(rig);
-        out.attach(&Attachment {
-            log_time: 0,
-            create_time: 0,
-            name: RIG_ATTACHMENT.to_owned(),
-            media_type: "application/toml".to_owned(),
-            data: Cow::Borrowed(toml.as_bytes()),
-        })
-        .map_err(io_error)?;
+        // The covariance first: a reader that has found the rig looks no further.
+        let (rig_beside, covariance) = with_covariance_beside(rig);
+        if let Some(csv) = covariance {
+            attach(&mut out, COVARIANCE_FILE, "text/csv", &csv)?;
+        }
+        let toml = rig_to_toml(&rig_beside);
+        attach(&mut out, RIG_ATTACHMENT, "application/toml", &toml)?;
         let mut ids = [0; Topic::ALL.len()];
         for (id, topic) in ids.iter_mut().zip(Topic::ALL) {
             *id = add_channel(&mut out, topic).map_err(io_error)?;
@@ -76,7 +74,8 @@ impl<W: Write + Seek> McapWriter<W> {
         let channels = &mut self.channels;
         self.topics.tell(estimate, features, images, channels)?;
         channels.number = channels.number.wrapping_add(1);
-        Ok(())
+        // Ends the chunk: one that is still open has no length yet, so that nothing in it could be read.
+        channels.out.flush().map_err(io_error)
     }
 
     /// Ends the file with its index.
@@ -105,12 +104,24 @@ impl<W: Write + Seek> Audience for Channels<W> {
         };
         self.out
             .write_to_known_channel(&header, message)
-            .map_err(io_error)?;
-        match topic {
-            Topic::Diagnostics => self.out.flush().map_err(io_error),
-            _ => Ok(()),
-        }
+            .map_err(io_error)
     }
+}
+
+fn attach<W: Write + Seek>(
+    out: &mut mcap::Writer<W>,
+    name: &str,
+    media_type: &str,
+    text: &str,
+) -> io::Result<()> {
+    out.attach(&Attachment {
+        log_time: 0,
+        create_time: 0,
+        name: name.to_owned(),
+        media_type: media_type.to_owned(),
+        data: Cow::Borrowed(text.as_bytes()),
+    })
+    .map_err(io_error)
 }
 
 fn add_channel<W: Write + Seek>(out: &mut mcap::Writer<W>, topic: Topic) -> mcap::McapResult<u16> {
