@@ -38,6 +38,7 @@ pub fn drops(cameras: Option<&Snapshot>, counts: &RunCounts, unpublished: u64) -
     drops.extend([
         both("queue", "stages_late", dropped),
         both("features", "failed", counts.unusable_in_features),
+        both("matching", "repeated", counts.unusable_as_repeats),
         both("matching", "failed", counts.unusable_in_matching),
         both("publication", "failed", unpublished),
     ]);
@@ -80,9 +81,10 @@ mod tests {
         cameras.cameras[1].unmatched.add(&WhyUnmatched::OtherSilent);
         cameras.dropped = 5;
         let counts = RunCounts {
-            unusable: 9,
+            unusable: 13,
             unusable_in_capture: 2,
             unusable_in_features: 1,
+            unusable_as_repeats: 4,
             unusable_in_matching: 6,
             ..RunCounts::default()
         };
@@ -91,9 +93,10 @@ mod tests {
         assert_eq!(count(&drops, "pairing", "other_silent", "right"), Some(1));
         assert_eq!(count(&drops, "queue", "stages_late", "both"), Some(5));
         assert_eq!(count(&drops, "features", "failed", "both"), Some(1));
+        assert_eq!(count(&drops, "matching", "repeated", "both"), Some(4));
         assert_eq!(count(&drops, "matching", "failed", "both"), Some(6));
         assert_eq!(count(&drops, "publication", "failed", "both"), Some(7));
-        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 23);
+        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 27);
     }
 
     #[test]

@@ -58,5 +58,8 @@ mod samples;
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod service;
 #[cfg(test)]
+#[cfg(feature = "ipc")]
+mod strangers;
+#[cfg(test)]
 #[cfg(feature = "v4l")]
 mod v4l2;
