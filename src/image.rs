@@ -71,11 +71,75 @@ impl GrayImage {
         &self.data[y as usize * width..][..width]
     }
 
+    /// A number by which images that differ in any pixel differ, but for chance; `None` for an image of one
+    /// grey value, which says nothing of when it was taken.
+    #[must_use]
+    pub fn fingerprint(&self) -> Option<u64> {
+        const LANES: usize = 4;
+        const ODD: u64 = 0x9E37_79B9_7F4A_7C15;
+        let mix = |hash: u64, word: u64| (hash ^ word).wrapping_mul(ODD).rotate_left(29);
+        let first = *self.data.first()?;
+        let mut lanes = [1_u64, 2, 3, 4];
+        let mut is_uniform = true;
+        let uniform = u64::from_ne_bytes([first; 8]);
+        // Lanes that do not wait for each other.
+        let mut blocks = self.data.chunks_exact(8 * LANES);
+        for block in &mut blocks {
+            for (lane, bytes) in lanes.iter_mut().zip(block.as_chunks::<8>().0) {
+                let word = u64::from_ne_bytes(*bytes);
+                is_uniform &= word == uniform;
+                *lane = mix(*lane, word);
+            }
+        }
+        for &byte in blocks.remainder() {
+            is_uniform &= byte == first;
+            lanes[0] = mix(lanes[0], u64::from(byte));
+        }
+        let size = (u64::from(self.width) << 32) | u64::from(self.height);
+        (!is_uniform).then(|| lanes.into_iter().fold(size, mix))
+    }
+
     /// Changes the size in place, keeping the allocation where it suffices; pixel values are
     /// unspecified afterwards.
     pub fn reshape(&mut self, width: u32, height: u32) {
         self.width = width;
         self.height = height;
         self.data.resize(width as usize * height as usize, 0);
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn fingerprints_tell_images_apart_by_any_pixel() {
+        let image = |change: Option<usize>| {
+            let mut data: Vec<u8> = (0..35 * 7).map(|i| (i * 7 % 251) as u8).collect();
+            if let Some(at) = change {
+                data[at] ^= 1;
+            }
+            GrayImage::from_vec(35, 7, data).expect("the size fits")
+        };
+        let of = |change| image(change).fingerprint();
+        assert_eq!(of(None), of(None));
+        for at in 0..35 * 7 {
+            assert_ne!(of(None), of(Some(at)), "{at}");
+        }
+        let other_shape = GrayImage::from_vec(7, 35, image(None).into_vec());
+        assert_ne!(other_shape.and_then(|i| i.fingerprint()), of(None));
+    }
+
+    #[test]
+    fn an_image_of_one_grey_value_has_no_fingerprint() {
+        for size in [1, 31, 32, 33, 64] {
+            let mut image = GrayImage::filled(size, 1, 9);
+            assert_eq!(image.fingerprint(), None);
+            if let Some(last) = image.pixels_mut().last_mut().filter(|_| size > 1) {
+                *last = 8;
+                assert!(image.fingerprint().is_some(), "{size}");
+            }
+        }
+        assert_eq!(GrayImage::default().fingerprint(), None);
     }
 }

@@ -122,6 +122,7 @@ mod running {
         }
         let mut silence = Silence::new(args.timeout, matches!(shown, Shown::View(_)));
         let mut messages = 0;
+        let mut complaint = String::new();
         loop {
             match subscriber.wait(silence.patience()) {
                 Ok(Wake::Terminated) => return Ok(()),
@@ -130,15 +131,22 @@ mod running {
                     Ok(None) => {}
                     Ok(Some(received)) => {
                         silence.end();
+                        complaint.clear();
                         messages += 1;
                         let is_last = args.count == Some(messages);
                         if shown.take(&received, is_last)? == Next::End || is_last {
                             return Ok(());
                         }
                     }
-                    Err(e) => shown.complain(&e),
+                    Err(e) => {
+                        shown.complain(&e.to_string(), &mut complaint);
+                        silence.note(&subscriber)?;
+                    }
                 },
-                Err(e) => shown.complain(&e),
+                Err(e) => {
+                    shown.complain(&e.to_string(), &mut complaint);
+                    silence.note(&subscriber)?;
+                }
             }
             if shown.pass_time(&silence)? == Next::End {
                 return Ok(());
@@ -249,7 +257,13 @@ mod running {
             }
         }
 
-        fn complain(&mut self, cause: &impl std::fmt::Display) {
+        /// Says what is wrong, once as long as it is the same: a publisher of another version would have it said
+        /// for every message. `last` is what was said before.
+        fn complain(&mut self, cause: &str, last: &mut String) {
+            if last == cause {
+                return;
+            }
+            cause.clone_into(last);
             eprintln!("visod: {cause}");
             if let Self::View(view) = self {
                 view.screen.move_on();

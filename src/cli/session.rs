@@ -24,7 +24,8 @@ use crate::output::publisher::Publisher;
 use crate::output::row::OdometryRow;
 use crate::output::tum::TumWriter;
 use crate::pipeline::{
-    self, Delivery, DropCount, Fault, Method, RunCounts, RunFigures, Share, Statistics, Undelivered,
+    self, Delivery, DropCount, Fault, Method, RunCounts, RunFigures, Share, Stage, Statistics,
+    Undelivered,
 };
 use crate::rig_watch::RigState;
 use crate::service::budget::{FrameBudget, Timing};
@@ -271,13 +272,18 @@ impl Session {
         let bar = progress::pairs(source.len_hint());
         let mut statistics = Statistics::start();
         let mut first_unusable = None;
+        let mut repeats = false;
         let mut last = None;
         pipeline::run(source, extractors, &mut method, |delivery| {
             statistics.add(delivery.odometry, &delivery.latencies, delivery.unusable);
-            if let Some(Fault { why, .. }) = delivery.unusable {
+            repeats &= delivery.unusable.is_some();
+            if let Some(Fault { stage, why }) = delivery.unusable {
                 let sequence = delivery.odometry.sequence;
                 // Cameras say themselves what happens to them, once and not for each pair.
+                // A frozen one does not.
+                let begins = stage == Stage::Repeats && !std::mem::replace(&mut repeats, true);
                 match self.live {
+                    Some(_) if begins => tracing::warn!(sequence, "{why}"),
                     Some(_) => tracing::debug!(sequence, why, "pair not usable"),
                     None => bar.suspend(|| {
                         eprintln!("visod: warning: pair {sequence} is not usable: {why}");
@@ -403,21 +409,17 @@ impl Session {
             let age_ns = i64::try_from(delivery.latencies.total.as_nanos()).unwrap_or(0);
             keeper.note(delivery.odometry, realtime_ns() - age_ns);
         }
-        if let Some((file, csv)) = &mut self.csv {
-            csv.write_row(&row)
-                .and_then(|()| csv.flush())
-                .map_err(|e| named(file, &e))?;
-        }
-        if let Some((file, trajectory)) = &mut self.trajectory {
-            trajectory
-                .write(row.timestamp_ns, &delivery.odometry.odom_from_camera)
-                .map_err(|e| named(file, &e))?;
-        }
+        let is_live = self.live.is_some();
+        write_to(&mut self.csv, is_live, |csv| {
+            csv.write_row(&row).and_then(|()| csv.flush())
+        })?;
+        write_to(&mut self.trajectory, is_live, |trajectory| {
+            trajectory.write(row.timestamp_ns, &delivery.odometry.odom_from_camera)
+        })?;
         #[cfg(feature = "mcap")]
-        if let Some((file, mcap)) = &mut self.mcap {
+        write_to(&mut self.mcap, is_live, |mcap| {
             mcap.add(delivery.odometry, delivery.method.tracked(), delivery.pair)
-                .map_err(|e| named(file, &e))?;
-        }
+        })?;
         #[cfg(feature = "foxglove")]
         self.present(delivery);
         if let Some(see) = &mut self.each_row {
@@ -604,6 +606,26 @@ fn latencies(
 /// The failure that an output file cannot be written.
 pub(crate) fn unwritable(file: &Path, cause: &io::Error) -> Failure {
     Failure::other(named(file, cause))
+}
+
+/// Writes to one of a run's files. Where that fails, a replay ends; a robot whose disk is full drives on, without
+/// this file.
+fn write_to<W>(
+    file: &mut Option<(PathBuf, W)>,
+    is_live: bool,
+    write: impl FnOnce(&mut W) -> io::Result<()>,
+) -> io::Result<()> {
+    let Some((path, writer)) = file else {
+        return Ok(());
+    };
+    match write(writer).map_err(|e| named(path, &e)) {
+        Err(e) if is_live => {
+            tracing::warn!("{e}: no more is written to it");
+            *file = None;
+            Ok(())
+        }
+        result => result,
+    }
 }
 
 /// The system's error with the file's name before it.

@@ -153,6 +153,23 @@ impl Odometer {
         )
     }
 
+    /// Whether a robot can have moved so since the reference, as far as the settings tell. `reference_from_now` is the
+    /// motion.
+    #[must_use]
+    pub fn is_possible(&self, reference_from_now: &Isometry3<f64>, timestamp_ns: i64) -> bool {
+        let dt_s = seconds_between(self.reference.timestamp_ns, timestamp_ns);
+        let is_within = |moved: f64, limit: Option<f64>| {
+            limit.is_none_or(|a_second| dt_s <= 0.0 || moved <= a_second * dt_s)
+        };
+        is_within(
+            reference_from_now.translation.vector.norm(),
+            self.settings.max_speed_m_s,
+        ) && is_within(
+            reference_from_now.rotation.angle(),
+            self.settings.max_turn_rad_s,
+        )
+    }
+
     /// Whether any motion has been measured since the odometry frame began.
     #[must_use]
     pub fn has_tracked(&self) -> bool {
@@ -205,15 +222,17 @@ impl Odometer {
             innovation_ratio: innovation_ratio(measured.variance_factor, self.variance_factor),
         };
         self.variance_factor = 0.8 * self.variance_factor + 0.2 * measured.variance_factor;
+        let is_possible = self.is_possible(&measured.estimate.prev_from_now, stamp.timestamp_ns);
         self.tracked_in_epoch = true;
         self.bridged = 0;
         self.reference = now;
         self.last = now;
         self.reference_from_last = no_motion();
         let is_flat = measured.departure.is_none_or(|d| d <= FLAT_LIMIT);
+        let is_plausible = is_flat && is_possible;
         let status = self
             .standing
-            .measured(measured.inliers, noise.innovation_ratio, is_flat);
+            .measured(measured.inliers, noise.innovation_ratio, is_plausible);
         self.row(stamp, status, &since_last, counts, noise)
     }
 

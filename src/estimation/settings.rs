@@ -89,6 +89,14 @@ pub struct Settings {
     /// 1 σ of a pair's time stamp, which makes velocities uncertain. s, 0 to 1, default 0.0001: what a
     /// computer's clock tells of a camera's.
     pub timestamp_sigma_s: f64,
+    /// The fastest that the robot can be: a motion that is faster was not its own, and the pair is lost (by the
+    /// estimators from pair to pair: degraded). m/s, 0.001 to 1000, default none.
+    pub max_speed_m_s: Option<f64>,
+    /// The same of its turn rate. rad/s, 0.001 to 1000, default none.
+    pub max_turn_rad_s: Option<f64>,
+    /// How many of a camera's last images are remembered: a pair with one that is the same to the byte is
+    /// refused, for the camera or its driver is frozen. 0 to 64, default 1; 0 takes whatever comes.
+    pub repeats: u32,
     /// Pairs without a measured motion that are bridged before the odometry frame begins anew. 0 to
     /// 10000, default 20.
     pub max_bridged: u32,
@@ -119,6 +127,9 @@ impl Default for Settings {
             max_landmarks: 300,
             keyframe_survival: 0.7,
             keyframe_parallax: 0.015,
+            max_speed_m_s: None,
+            max_turn_rad_s: None,
+            repeats: 1,
             max_bridged: 20,
             acceleration_m_s2: 2.0,
             angular_acceleration_rad_s2: 2.0,
@@ -148,6 +159,15 @@ impl Settings {
         SettingError::unless_in("flat_sigma_m", self.flat_sigma_m, 1e-5..=1.0)?;
         SettingError::unless_in("flat_sigma_rad", self.flat_sigma_rad, 1e-5..=1.0)?;
         SettingError::unless_in("timestamp_sigma_s", self.timestamp_sigma_s, 0.0..=1.0)?;
+        for (key, limit) in [
+            ("max_speed_m_s", self.max_speed_m_s),
+            ("max_turn_rad_s", self.max_turn_rad_s),
+        ] {
+            if let Some(limit) = limit {
+                SettingError::unless_in(key, limit, 0.001..=1000.0)?;
+            }
+        }
+        SettingError::unless_in("repeats", self.repeats, 0..=64)?;
         SettingError::unless_in("max_bridged", self.max_bridged, 0..=10_000)?;
         SettingError::unless_in("acceleration_m_s2", self.acceleration_m_s2, 1e-6..=1000.0)?;
         SettingError::unless_in(

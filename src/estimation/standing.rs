@@ -44,15 +44,15 @@ impl Standing {
         self.good_in_a_row = 0;
     }
 
-    /// The status of a pair that was measured; `is_flat` is false where the ground is taken as flat
-    /// and proves not to be.
+    /// The status of a pair that was measured; `is_plausible` is false where the ground is taken as flat
+    /// and proves not to be, and where no robot moves like that.
     pub(super) fn measured(
         &mut self,
         inliers: u32,
         innovation_ratio: f64,
-        is_flat: bool,
+        is_plausible: bool,
     ) -> Status {
-        let good = inliers >= self.good_inliers && innovation_ratio <= REJECTED && is_flat;
+        let good = inliers >= self.good_inliers && innovation_ratio <= REJECTED && is_plausible;
         let to_spare = f64::from(inliers) >= RISE_RATIO * f64::from(self.good_inliers)
             && innovation_ratio < FINE;
         self.good_in_a_row = if good {

@@ -12,6 +12,7 @@
 //! | `world` | landmarks and the path; their noisy sights, run by run |
 //! | `triangulation`, `motion`, `odometry` | the three stages of the thesis |
 //! | `images` | a fourth: rendered sequences through the whole pipeline |
+//! | `corrupted` | such sequences with corrupted pairs in them |
 //! | [`estimator`] | what the odometry stage tries out: any [`FrameEstimator`] |
 //! | `chain` | such an estimator: two-frame motions, chained with their correlation |
 //! | `window` | another: the window of keyframes that the pipeline runs |
@@ -21,6 +22,7 @@
 
 mod bound;
 mod chain;
+mod corrupted;
 mod ellipse;
 pub mod estimator;
 mod figures;
@@ -38,6 +40,7 @@ mod window;
 mod world;
 
 pub use chain::TwoFrameChain;
+pub use corrupted::{CorruptedOutcome, Tally as CorruptedTally, Wrong as WrongRow, run_corrupted};
 pub use estimator::{FrameEstimate, FrameEstimator, TrackedSight};
 pub use images::{ImagesOutcome, SEQUENCES, Sequence, run_images};
 pub use motion::{MotionOutcome, run_motion};

@@ -7,6 +7,7 @@ use super::publication::{
     FEATURES_BUFFER, FEATURES_SERVICE, HEALTH_BUFFER, HEALTH_SERVICE, MAX_NODES, MAX_PUBLISHERS,
     MAX_SUBSCRIBERS, ODOMETRY_BUFFER, ODOMETRY_SERVICE, Settings, events,
 };
+use super::room;
 use crate::settings::SettingError;
 use iceoryx2::prelude::{
     Config, FileName, Node, NodeBuilder, NodeName, Path, SemanticString, ServiceName,
@@ -189,6 +190,7 @@ pub(super) fn open_node(
         root: config.global.root_path().to_string(),
         cause,
     };
+    room::check().map_err(failed)?;
     let name = NodeName::new(name).map_err(|e| failed(e.to_string()))?;
     NodeBuilder::new()
         .name(&name)

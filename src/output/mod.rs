@@ -33,6 +33,8 @@ pub mod publication;
 #[cfg(feature = "ipc")]
 pub mod publisher;
 pub mod report;
+#[cfg(feature = "ipc")]
+mod room;
 pub mod row;
 #[cfg(feature = "ipc")]
 pub mod subscriber;

@@ -18,6 +18,7 @@ use super::health::HealthMessage;
 use super::ipc::{Ipc, IpcError, Payload, Services, monotonic_ns, open_node};
 use super::message::OdometryMessage;
 use super::publication::{Settings, events};
+use super::room;
 use iceoryx2::port::{
     notifier::Notifier, publisher::Publisher as Port, update_connections::UpdateConnections,
 };
@@ -51,6 +52,11 @@ impl Publisher {
             .features
             .then(|| Channel::open(&node, settings.exclusive))
             .transpose()?;
+        let global = &node.config().global;
+        room::take(&global.prefix.to_string()).map_err(|cause| IpcError::Node {
+            root: global.root_path().to_string(),
+            cause,
+        })?;
         Ok(Self {
             odometry,
             features,

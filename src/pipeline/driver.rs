@@ -9,7 +9,7 @@
 //! and what is in them does not depend on how many workers there are. A fixed number of pairs is
 //! under way at once: their buffers go round, so that nothing is allocated after the first few.
 
-use super::method::{Described, DescribedPair, Method};
+use super::method::{Described, DescribedPair, Method, StepError};
 use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
@@ -96,6 +96,8 @@ pub enum Stage {
     Capture,
     /// No features could be looked for.
     Features,
+    /// An image is one that the camera has shown before.
+    Repeats,
     /// Its features could not be matched.
     Matching,
 }
@@ -274,7 +276,7 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
     while let Ok(mut job) = jobs.recv() {
         let started = Instant::now();
         let result = extractor.extract(&job.image, &mut job.described.features);
-        job.described.pyramid.fill(&job.image);
+        job.described.take(&job.image);
         let side = Done::Side {
             took: started.elapsed(),
             failed: result.err().map(|e| e.to_string()),
@@ -384,6 +386,13 @@ struct Outcome {
     buffers: Spare,
 }
 
+fn stage_of(error: &StepError) -> Stage {
+    match error {
+        StepError::Repeated(_) => Stage::Repeats,
+        StepError::Match(_) => Stage::Matching,
+    }
+}
+
 /// Takes one complete event through the method. `described` only lends its memory.
 fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> Option<Outcome> {
     match event {
@@ -413,7 +422,7 @@ fn step(event: Pending, method: &mut Method, described: &mut DescribedPair) -> O
                 Some(why) => Err((Stage::Features, why)),
                 None => method
                     .step(described)
-                    .map_err(|e| (Stage::Matching, e.to_string())),
+                    .map_err(|e| (stage_of(&e), e.to_string())),
             };
             let (odometry, fault) = match stepped {
                 Ok(odometry) => (odometry, None),

@@ -53,6 +53,7 @@ pub fn drops(
     drops.extend([
         both("queue", "stages_late", dropped),
         both("features", "failed", counts.unusable_in_features),
+        both("matching", "repeated", counts.unusable_as_repeats),
         both("matching", "failed", counts.unusable_in_matching),
         both("publication", "failed", undelivered.unpublished),
         both("recording", "disk_behind", undelivered.unrecorded),
@@ -97,9 +98,10 @@ mod tests {
         cameras.cameras[1].unmatched.add(&WhyUnmatched::OtherSilent);
         cameras.dropped = 5;
         let counts = RunCounts {
-            unusable: 9,
+            unusable: 13,
             unusable_in_capture: 2,
             unusable_in_features: 1,
+            unusable_as_repeats: 4,
             unusable_in_matching: 6,
             ..RunCounts::default()
         };
@@ -113,11 +115,12 @@ mod tests {
         assert_eq!(count(&drops, "pairing", "other_silent", "right"), Some(1));
         assert_eq!(count(&drops, "queue", "stages_late", "both"), Some(5));
         assert_eq!(count(&drops, "features", "failed", "both"), Some(1));
+        assert_eq!(count(&drops, "matching", "repeated", "both"), Some(4));
         assert_eq!(count(&drops, "matching", "failed", "both"), Some(6));
         assert_eq!(count(&drops, "publication", "failed", "both"), Some(7));
         assert_eq!(count(&drops, "recording", "disk_behind", "both"), Some(8));
         assert_eq!(count(&drops, "view", "no_time", "both"), Some(10));
-        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 41);
+        assert_eq!(drops.iter().map(|d| d.count).sum::<u64>(), 45);
     }
 
     #[test]

@@ -4,6 +4,7 @@
 //! several images at once; everything else depends on the pair before and is done in order: by the
 //! window of keyframes ([`super::windowed`]), or from pair to pair ([`super::two_frame`]).
 
+use super::repeats::{Repeated, Repeats};
 use super::two_frame::TwoFrame;
 use super::windowed::Windowed;
 use crate::capture::{Skew, StereoPair};
@@ -13,6 +14,7 @@ use crate::estimation::{
 };
 use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
+use crate::image::GrayImage;
 use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
 };
@@ -30,6 +32,16 @@ pub struct Described {
     pub features: Features,
     /// Its reductions.
     pub pyramid: Pyramid,
+    /// What tells it from other images; `None` for one that says nothing.
+    pub fingerprint: Option<u64>,
+}
+
+impl Described {
+    /// Takes on what needs no extractor.
+    pub fn take(&mut self, image: &GrayImage) {
+        self.pyramid.fill(image);
+        self.fingerprint = image.fingerprint();
+    }
 }
 
 /// A pair with the features of both its images.
@@ -113,8 +125,20 @@ enum Estimator {
 pub struct Method {
     bench: Workbench,
     estimator: Estimator,
+    repeats: Repeats,
     times: StageTimes,
     has_stepped: bool,
+}
+
+/// Why a pair gives no estimate of its own.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum StepError {
+    /// A camera hands on what it has handed on before.
+    #[error(transparent)]
+    Repeated(#[from] Repeated),
+    /// Its features could not be matched.
+    #[error(transparent)]
+    Match(#[from] MatchError),
 }
 
 impl Method {
@@ -150,6 +174,7 @@ impl Method {
             beginning: (0, None),
         };
         Some(Self {
+            repeats: Repeats::new(bench.estimation.repeats),
             bench,
             estimator,
             times: StageTimes::default(),
@@ -180,10 +205,11 @@ impl Method {
     /// Takes the next pair and says where the camera is.
     ///
     /// # Errors
-    /// Its features could not be matched. The method stands as before the pair, which is then to be
-    /// [skipped](Self::skip).
-    pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, MatchError> {
+    /// An image is one that the camera has shown before, or its features could not be matched. The method stands
+    /// as before the pair, which is then to be [skipped](Self::skip).
+    pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, StepError> {
         self.has_stepped = false;
+        self.repeats.check(pair)?;
         std::mem::swap(&mut self.bench.now.pair, pair);
         let started = Instant::now();
         self.bench.matched = None;
@@ -360,7 +386,7 @@ impl DescribedPair {
         self.skew = pair.skew;
         for (side, image) in [(&mut self.left, &pair.left), (&mut self.right, &pair.right)] {
             extractor.extract(image, &mut side.features)?;
-            side.pyramid.fill(image);
+            side.take(image);
         }
         Ok(())
     }

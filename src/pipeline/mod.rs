@@ -8,6 +8,7 @@ mod gallery;
 mod histogram;
 mod method;
 mod occupancy;
+mod repeats;
 mod statistics;
 mod trim;
 mod two_frame;
@@ -15,6 +16,7 @@ mod windowed;
 
 pub use driver::{Delivery, Fault, PipelineError, Settings, Stage, StageLatencies, run};
 pub use drops::{DropCount, Undelivered, drops};
-pub use method::{Described, DescribedPair, Method, StageTimes};
+pub use method::{Described, DescribedPair, Method, StageTimes, StepError};
+pub use repeats::Repeated;
 pub use statistics::{RunCounts, RunFigures, StageFigures, Statistics};
 pub use trim::Share;

@@ -31,6 +31,8 @@ pub struct RunCounts {
     pub unusable_in_capture: u64,
     /// Those of them in which no features could be looked for.
     pub unusable_in_features: u64,
+    /// Those of them of which an image is one that the camera had shown before.
+    pub unusable_as_repeats: u64,
     /// Those of them whose features could not be matched.
     pub unusable_in_matching: u64,
     /// Pairs that began an odometry frame.
@@ -129,6 +131,7 @@ impl Statistics {
             match fault.stage {
                 Stage::Capture => counts.unusable_in_capture += 1,
                 Stage::Features => counts.unusable_in_features += 1,
+                Stage::Repeats => counts.unusable_as_repeats += 1,
                 Stage::Matching => counts.unusable_in_matching += 1,
             }
             return;

@@ -123,7 +123,9 @@ impl Windowed {
         predicted: &Isometry3<f64>,
         stamp: PairStamp,
     ) -> Odometry {
-        let consent = self.consent(bench, predicted, stamp.sequence);
+        let consent = self
+            .consent(bench, predicted, stamp.sequence)
+            .filter(|motion| odometer.is_possible(motion, stamp.timestamp_ns));
         let tracked = consent.and_then(|newest_from_now| {
             self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());

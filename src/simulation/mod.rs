@@ -16,6 +16,7 @@
 //! faster.
 
 mod camera;
+pub mod corruption;
 mod dataset_writer;
 #[cfg(feature = "aravis")]
 pub mod gige;

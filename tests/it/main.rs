@@ -64,6 +64,9 @@ mod scenarios;
 #[cfg(all(feature = "aravis", feature = "ipc"))]
 mod service;
 #[cfg(test)]
+#[cfg(feature = "ipc")]
+mod strangers;
+#[cfg(test)]
 mod supply_chain;
 #[cfg(test)]
 #[cfg(feature = "v4l")]

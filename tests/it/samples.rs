@@ -68,6 +68,8 @@ fn all_keys() -> BTreeSet<String> {
         controls: [("BlackLevel".to_owned(), ControlValue::Integer(0))].into(),
         ..CameraSettings::default()
     });
+    config.estimation.max_speed_m_s = Some(3.0);
+    config.estimation.max_turn_rad_s = Some(4.0);
     config.publish.root = Some("/run/visod".into());
     config.publish.prefix = Some("robot1_".to_owned());
     config.last_pose.file = Some("/var/lib/visod/last_pose.toml".into());

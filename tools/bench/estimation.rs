@@ -52,7 +52,7 @@ fn measure(name: &str, recording: &Recording, settings: Settings) {
             (&mut pair.right, right, &images.right),
         ] {
             side.features.clone_from(features);
-            side.pyramid.fill(image);
+            side.take(image);
         }
         pair.sequence = place;
         pair.timestamp_ns = 100_000_000 * place as i64;

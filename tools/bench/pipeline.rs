@@ -205,8 +205,8 @@ fn divided(recording: &Recording) -> [Vec<f64>; 4] {
             assert_eq!(extractor.extract(image, &mut side.features), Ok(()));
         }
         let found = thread_time();
-        pair.left.pyramid.fill(&images.left);
-        pair.right.pyramid.fill(&images.right);
+        pair.left.take(&images.left);
+        pair.right.take(&images.right);
         let reduced = thread_time();
         (pair.sequence, pair.timestamp_ns) = (place, 100_000_000 * place as i64);
         assert!(method.step(&mut pair).is_ok());

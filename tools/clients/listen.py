@@ -6,7 +6,7 @@ import dataclasses
 import json
 import sys
 
-from visod_client import OdometrySubscriber
+from visod_client import MessageError, OdometrySubscriber, ServiceError
 
 
 def main() -> int:
@@ -42,6 +42,8 @@ def describe(estimate) -> str:
 if __name__ == "__main__":
     try:
         sys.exit(main())
+    except (MessageError, ServiceError) as e:
+        sys.exit(f"listen.py: {e}")
     except KeyboardInterrupt:
         sys.exit(0)
     except BrokenPipeError:

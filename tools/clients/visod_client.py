@@ -74,6 +74,10 @@ class MessageError(ValueError):
     """A message that this client cannot use."""
 
 
+class ServiceError(RuntimeError):
+    """A service that this client cannot use."""
+
+
 class OdometryMessage(ctypes.Structure):
     """`visod/odometry`, layout version 1."""
 
@@ -450,6 +454,18 @@ def _symmetric(triangle: Array) -> Array:
     return matrix
 
 
+def _explain(cause: str) -> str:
+    """iceoryx2's reasons in words, where a user can do something about them."""
+    reasons = {
+        "InsufficientPermissions": "its files belong to another user",
+        "IncompatibleTypes": "a process of another version uses it",
+        "VersionMismatch": "a process of another version uses it",
+        "DoesNotSupportRequested": "a process that has it open created it with other sizes",
+        "ExceedsMax": "too many processes use it already",
+    }
+    return next((f"{words} ({cause})" for word, words in reasons.items() if word in cause), cause)
+
+
 T = TypeVar("T")
 
 
@@ -488,6 +504,13 @@ class _Subscriber(Generic[T]):
             .config(config)
             .create(iox2.ServiceType.Ipc)
         )
+        try:
+            self._open()
+        except Exception as e:  # iceoryx2's own errors have no common base but this
+            # What iceoryx2 says goes on, but not as the last word.
+            raise ServiceError(f"{self._service} cannot be used: {_explain(repr(e))}") from e
+
+    def _open(self) -> None:
         name = iox2.ServiceName.new(self._service)
         self._events = (
             self._node.service_builder(name)

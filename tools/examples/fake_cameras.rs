@@ -1,15 +1,22 @@
 //! Serves a recording as two GigE Vision cameras, until its standard input ends or says `quit`.
 //!
 //! Meant to be run by `tools/fake-cameras`, which gives it a network of its own. Standard input takes a
-//! command a line: `unplug left`, `plug left`, `lose 0.01` (a share of the packets), `quit`.
+//! command a line: `unplug left`, `plug left`, `lose 0.01` (a share of the packets), `spoil black` (what the images
+//! show, by the words of `visod::simulation::corruption`, `spoil none` for what they should), `step 500` (sets the
+//! clocks of both cameras forth, or back, by so many ms), `quit`.
 
 use clap::Parser;
+use rand::SeedableRng;
+use rand_xoshiro::Xoshiro256PlusPlus;
 use std::io::BufRead;
 use std::path::PathBuf;
 use std::process::ExitCode;
-use std::sync::Arc;
-use visod::capture::{Dataset, Side};
-use visod::simulation::gige::{CameraClock, GigeCamera, RecordedImages, Together};
+use std::sync::atomic::{AtomicI64, Ordering};
+use std::sync::{Arc, PoisonError, RwLock};
+use visod::capture::{Dataset, Side, Skew, StereoPair};
+use visod::image::GrayImage;
+use visod::simulation::corruption::{Corruption, MAX_LAG, Material, Spoiler};
+use visod::simulation::gige::{CameraClock, GigeCamera, Images, RecordedImages, Together};
 
 /// Serve a recording as two GigE Vision cameras.
 #[derive(Parser)]
@@ -36,10 +43,69 @@ struct Args {
     leave_none_out: bool,
 }
 
+/// A recording that may be spoilt while it is shown.
+struct Shown {
+    recorded: RecordedImages,
+    spoilt: RwLock<Option<Vec<[Arc<GrayImage>; 2]>>>,
+    ahead_ns: AtomicI64,
+}
+
+impl Shown {
+    fn spoil(&self, kind: Corruption) {
+        let spoilt = (kind != Corruption::None).then(|| self.spoilt_as(kind));
+        *self.spoilt.write().unwrap_or_else(PoisonError::into_inner) = spoilt;
+    }
+
+    /// All pairs as one run of spoilt ones; those that have no others before or behind them take after them.
+    fn spoilt_as(&self, kind: Corruption) -> Vec<[Arc<GrayImage>; 2]> {
+        let count = self.len();
+        let image = |at: usize, side| (*self.recorded.image(at, side)).clone();
+        let pair = |at: usize| StereoPair {
+            sequence: at as u64,
+            timestamp_ns: self.recorded.timestamp_ns(at),
+            skew: Skew::default(),
+            left: image(at, Side::Left),
+            right: image(at, Side::Right),
+        };
+        let around = (0..count + 2 * (MAX_LAG + 1))
+            .map(|i| pair((i + count * (MAX_LAG + 1) - (MAX_LAG + 1)) % count));
+        let pairs: Vec<StereoPair> = around.collect();
+        let other_place = pair(count / 2);
+        let material = Material {
+            pairs: &pairs,
+            other_place: &other_place,
+        };
+        let rng = Xoshiro256PlusPlus::seed_from_u64(1);
+        let mut spoiler = Spoiler::new(kind, material, [MAX_LAG + 1, count], rng);
+        let spoilt = (0..count).map(|i| spoiler.pair(MAX_LAG + 1 + i).pair);
+        spoilt
+            .map(|pair| [Arc::new(pair.left), Arc::new(pair.right)])
+            .collect()
+    }
+}
+
+impl Images for Shown {
+    fn len(&self) -> usize {
+        self.recorded.len()
+    }
+
+    fn timestamp_ns(&self, at: usize) -> i64 {
+        self.recorded.timestamp_ns(at) + self.ahead_ns.load(Ordering::Relaxed)
+    }
+
+    fn image(&self, at: usize, side: Side) -> Arc<GrayImage> {
+        let spoilt = self.spoilt.read().unwrap_or_else(PoisonError::into_inner);
+        match &*spoilt {
+            Some(images) => Arc::clone(&images[at][side as usize]),
+            None => self.recorded.image(at, side),
+        }
+    }
+}
+
 /// The two cameras, each plugged in or not.
 struct Cameras {
     args: Args,
-    images: Arc<RecordedImages>,
+    images: Arc<Shown>,
     rate_hz: f64,
     together: Arc<Together>,
     plugged: [Option<GigeCamera>; 2],
@@ -93,6 +159,18 @@ impl Cameras {
                     camera.lose_packets(self.lose);
                 }
             }
+            ["spoil", word] => {
+                let kind = serde_json::from_value(word.into());
+                self.images.spoil(kind.map_err(|e| format!("{word}: {e}"))?);
+            }
+            ["step", ms] => {
+                let ms: i64 = ms
+                    .parse()
+                    .map_err(|_| format!("{ms}: is no number of ms"))?;
+                self.images
+                    .ahead_ns
+                    .fetch_add(ms * 1_000_000, Ordering::Relaxed);
+            }
             _ => return Err(format!("{line}: is no command")),
         }
         Ok(true)
@@ -101,8 +179,13 @@ impl Cameras {
 
 fn serve(args: Args) -> Result<(), String> {
     let dataset = Dataset::open(&args.dataset, None).map_err(|e| e.to_string())?;
-    let images = Arc::new(RecordedImages::decode(&dataset)?);
-    let rate_hz = args.rate.unwrap_or(1.0 / images.period_s());
+    let recorded = RecordedImages::decode(&dataset)?;
+    let rate_hz = args.rate.unwrap_or(1.0 / recorded.period_s());
+    let images = Arc::new(Shown {
+        recorded,
+        spoilt: RwLock::default(),
+        ahead_ns: AtomicI64::new(0),
+    });
     let lose = args.lose;
     let together = if args.leave_none_out {
         Together::leaving_none_out()
