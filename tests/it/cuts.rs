@@ -125,10 +125,11 @@ fn a_folder_cut_at_any_of_a_thousand_bytes_replays_every_whole_pair() {
     let stream = Stream::of(&pairs, &rig);
     let mut random = Xoshiro256PlusPlus::seed_from_u64(2);
     let mut most = 0;
-    // Lines of times are short beside images: every byte of the last but one, too.
+    // Lines of times are short beside images: every byte of the last two, too.
     let line = stream.whole_at[PAIRS as usize - 2];
     let cuts = (0..CUTS).map(|_| random.random_range(0..=stream.bytes()));
-    for cut in cuts.chain(line - 14..line + 3) {
+    let end = stream.bytes();
+    for cut in cuts.chain(line - 14..line + 3).chain(end - 14..=end) {
         let folder = tempfile::tempdir().unwrap();
         stream.write(folder.path(), cut);
         let whole = stream.whole_at.iter().filter(|at| **at <= cut).count();
