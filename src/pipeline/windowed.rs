@@ -143,7 +143,13 @@ impl Windowed {
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
-        let row = odometer.arrive(stamp, &tracked, counts, self.agreement);
+        // A first motion is sought far around, where much is found that does not belong together.
+        let agreement = if odometer.has_velocity() {
+            self.agreement
+        } else {
+            1.0
+        };
+        let row = odometer.arrive(stamp, &tracked, counts, agreement);
         if self.wants_keyframe(bench) {
             self.promote(bench);
         }
