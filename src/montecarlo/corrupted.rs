@@ -343,6 +343,8 @@ struct Judge {
     run: u64,
     limit: f64,
     before: Option<Isometry3<f64>>,
+    /// Where the odometry frame began.
+    origin: Isometry3<f64>,
     since: Option<usize>,
     tally: Tally,
     wrong: Vec<Wrong>,
@@ -355,6 +357,7 @@ impl Judge {
             run,
             limit: chi2_quantile(1.0 - BEYOND_5_SIGMA, 6.0),
             before: None,
+            origin: Isometry3::identity(),
             since: None,
             tally: Tally::default(),
             wrong: Vec::new(),
@@ -367,9 +370,13 @@ impl Judge {
         } else {
             self.since.map(|since| since + 1)
         };
+        // Until something has been tracked, a frame begins anew where the camera is.
+        if row.status == Status::Initializing && row.epoch == 0 {
+            self.origin = *truth;
+        }
         let before = self.before.replace(*truth).unwrap_or(*truth);
         let tally = &mut self.tally;
-        let pose_error = se3::error_fixed_axes(&row.odom_from_camera, truth);
+        let pose_error = se3::error_fixed_axes(&row.odom_from_camera, &self.origin.inv_mul(truth));
         let motion_error = se3::error_fixed_axes(&row.prev_from_now, &before.inv_mul(truth));
         let pose = nees(&pose_error, &row.cov_pose);
         let motion = nees(&motion_error, &row.cov_motion);

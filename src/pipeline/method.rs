@@ -234,8 +234,8 @@ impl Method {
         self.times = StageTimes::default();
         self.has_stepped = false;
         match &mut self.bench.odometer {
-            Some(odometer) if odometer.has_tracked() => odometer.bridge(stamp, Counts::default()),
-            Some(odometer) => odometer.begin(stamp, Counts::default()),
+            // Also before anything was tracked: the next motion is one since an earlier pair.
+            Some(odometer) => odometer.bridge(stamp, Counts::default()),
             None => self
                 .bench
                 .new_odometer(stamp)

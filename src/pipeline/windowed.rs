@@ -44,6 +44,8 @@ pub(super) struct Windowed {
     weights: Vec<f64>,
     /// Indices of those of `seen` that agree with the motion.
     agreed: Vec<u32>,
+    /// The share of the landmarks that were recognised which agree with the motion.
+    agreement: f64,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
     /// Whether a stereo match of the present pair shows a landmark that is known.
@@ -69,6 +71,7 @@ impl Windowed {
             unsure: Vec::new(),
             weights: Vec::new(),
             agreed: Vec::new(),
+            agreement: 0.0,
             matches: Vec::new(),
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
@@ -140,7 +143,13 @@ impl Windowed {
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
-        let row = odometer.arrive(stamp, &tracked, counts);
+        // A first motion is sought far around, where much is found that does not belong together.
+        let agreement = if odometer.has_velocity() {
+            self.agreement
+        } else {
+            1.0
+        };
+        let row = odometer.arrive(stamp, &tracked, counts, agreement);
         if self.wants_keyframe(bench) {
             self.promote(bench);
         }
@@ -171,10 +180,13 @@ impl Windowed {
     ) -> Odometry {
         let counts = bench.counts(0);
         if !odometer.has_tracked() {
-            let row = odometer.begin(stamp, counts);
-            if bench.now.matches.len() >= bench.estimation.min_inliers as usize {
-                self.begin(bench, odometer);
+            // Where there is nothing to begin with, the window keeps the pair that it has, and so must the odometer:
+            // else the next motion would be called one since this pair.
+            if bench.now.matches.len() < bench.estimation.min_inliers as usize {
+                return odometer.bridge(stamp, counts);
             }
+            let row = odometer.begin(stamp, counts);
+            self.begin(bench, odometer);
             return row;
         }
         if odometer.should_begin_anew() {
@@ -279,6 +291,7 @@ impl Windowed {
                     .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
         }
         let newest_from_now = newest_from_now?;
+        self.agreement = self.agreed.len() as f64 / self.seen.len().max(1) as f64;
         self.take_note(bench);
         Some(newest_from_now)
     }

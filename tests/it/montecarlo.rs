@@ -127,3 +127,43 @@ fn mistakes_are_told_in_a_sentence() {
         );
     }
 }
+
+/// The short form of `cargo bench --bench corrupted`. What two images cannot be told from one honest pair by is left
+/// out: there the bench counts.
+#[test]
+fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
+    use visod::geometry::RigUncertainty;
+    use visod::simulation::corruption::Corruption;
+    let rig = visod::geometry::StereoRig {
+        uncertainty: Some(RigUncertainty::Sigmas {
+            focal_px: 0.3,
+            principal_point_px: 0.3,
+            rotation_rad: 1e-4,
+            translation_m: 2e-4,
+        }),
+        ..visod::simulation::small_rig()
+    };
+    let outcome = visod::montecarlo::run_corrupted(&rig, 1, 1, &|_| {}).unwrap();
+    println!("{}", outcome.to_table());
+    assert!(outcome.total().corrupted > 200);
+    for (kind, tally) in &outcome.kinds {
+        assert_eq!(tally.invalid, 0, "{kind:?}");
+        let must_hold = matches!(
+            kind,
+            Corruption::None
+                | Corruption::Black
+                | Corruption::BlackSide
+                | Corruption::Saturated
+                | Corruption::Swapped
+                | Corruption::Frozen
+                | Corruption::FrozenSide
+                | Corruption::LateSide
+                | Corruption::OtherPlace
+                | Corruption::OtherPlaceSide
+        );
+        if must_hold {
+            assert_eq!(tally.wrong_motions + tally.wrong_poses, 0, "{kind:?}");
+            assert!(tally.tracking > 10, "{kind:?} {}", tally.tracking);
+        }
+    }
+}
