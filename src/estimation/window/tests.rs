@@ -326,7 +326,7 @@ const DEPTHS_M: [[f64; 2]; 5] = [
 fn every_covariance_is_one_under_ten_thousand_configurations() {
     let rig = simulation::thesis_rig();
     let (mut given, mut refused) = (0, 0);
-    for seed in 0..400 {
+    for seed in 0..560 {
         let mut rng = Xoshiro256PlusPlus::seed_from_u64(seed);
         let world = points::Settings {
             landmarks: rng.random_range(6..30),
@@ -382,8 +382,5 @@ fn every_covariance_is_one_under_ten_thousand_configurations() {
         }
     }
     println!("{given} given, {refused} refused");
-    assert!(
-        given + refused > 9_000 && given > 5_000,
-        "{given}, {refused}"
-    );
+    assert!(given >= 10_000, "{given}, {refused}");
 }
