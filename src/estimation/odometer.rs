@@ -444,9 +444,9 @@ impl Noise {
     }
 }
 
-/// The share of recognised landmarks that has to agree with a motion. Below, the images show two motions, such as those
+/// The share of votes of recognised landmarks that a motion has to have. Below, the images show two motions, such as those
 /// of a body that fills the view or of images in two parts, and which is the robot's is a guess.
-const LEAST_AGREEMENT: f64 = 0.6;
+const LEAST_AGREEMENT: f64 = 0.5;
 
 /// Normalised innovations squared that a noise model is rejected at: residuals of twice the σ that
 /// the pairs before lead to expect.

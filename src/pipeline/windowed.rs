@@ -44,7 +44,7 @@ pub(super) struct Windowed {
     weights: Vec<f64>,
     /// Indices of those of `seen` that agree with the motion.
     agreed: Vec<u32>,
-    /// The share of the landmarks that were recognised which agree with the motion.
+    /// The share of the votes of recognised landmarks that are for the motion.
     agreement: f64,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
@@ -291,9 +291,16 @@ impl Windowed {
                     .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
         }
         let newest_from_now = newest_from_now?;
-        self.agreement = self.agreed.len() as f64 / self.seen.len().max(1) as f64;
+        self.agreement = self.share_of_agreed();
         self.take_note(bench);
         Some(newest_from_now)
+    }
+
+    /// Each part of the image has one vote here, too.
+    fn share_of_agreed(&self) -> f64 {
+        let agreed: f64 = self.agreed.iter().map(|&i| self.weights[i as usize]).sum();
+        let all: f64 = self.weights.iter().sum();
+        agreed / all.max(f64::MIN_POSITIVE)
     }
 
     /// Has the watch on the rig look at the landmarks that agree with a motion. Where none was found, the right

@@ -118,7 +118,7 @@ fn a_wrong_configuration_is_named_with_file_line_and_key() {
     }
     std::fs::write(folder.path().join("c.toml"), b"\xff\xfe").unwrap();
     let output = replay(folder.path(), &[dataset, "--config", "c.toml"]);
-    assert_refused(&output, 2, &["c.toml: cannot be read"]);
+    assert_refused(&output, 2, &["c.toml:1: is not UTF-8 text"]);
     let output = replay(folder.path(), &[dataset, "--config", "none.toml"]);
     assert_refused(&output, 2, &["none.toml: cannot be read"]);
 }

@@ -67,7 +67,7 @@ fn bodies_that_move_along_do_not_lead_the_estimate() {
         "--trajectory",
         "slalom",
         "--frames",
-        "30",
+        "16",
     ]);
     assert!(drive.run.rows[1..].iter().all(|row| row.status == Tracking));
     let drift = drive.drift();
@@ -82,7 +82,7 @@ fn turning_on_the_spot_by_seven_degrees_from_pair_to_pair_is_followed() {
         "--trajectory",
         "fast-turn",
         "--frames",
-        "25",
+        "15",
     ]);
     assert!(drive.run.rows[1..].iter().all(|row| row.status == Tracking));
     let truth = drive.truth();
@@ -90,28 +90,28 @@ fn turning_on_the_spot_by_seven_degrees_from_pair_to_pair_is_followed() {
         .windows(2)
         .map(|two| two[0].rotation.angle_to(&two[1].rotation))
         .sum();
-    assert!(turned_rad > 24.0 * 6.9_f64.to_radians(), "{turned_rad}");
+    assert!(turned_rad > 14.0 * 6.9_f64.to_radians(), "{turned_rad}");
     let last = drive.run.rows.last().unwrap();
-    let off_rad = last.odom_from_camera.rotation.angle_to(&truth[24].rotation);
+    let off_rad = last.odom_from_camera.rotation.angle_to(&truth[14].rotation);
     assert!(
         off_rad < 0.001 * turned_rad,
         "{off_rad} of {turned_rad} rad"
     );
-    assert!(errors_m(&drive.run.rows, &truth)[24] < 0.005);
+    assert!(errors_m(&drive.run.rows, &truth)[14] < 0.005);
 }
 
 #[test]
 fn a_robot_that_stops_neither_drifts_nor_grows_its_covariance() {
-    // At 4 Hz: stands from second 6 to second 8.
+    // At 2 Hz: stands from second 6 to second 8.
     let arguments = [
         "--scene",
         "hall",
         "--trajectory",
         "stop-and-go",
         "--rate",
-        "4",
+        "2",
         "--frames",
-        "40",
+        "20",
     ];
     let drive = Drive::new(&arguments);
     let rows = &drive.run.rows;
@@ -124,7 +124,7 @@ fn a_robot_that_stops_neither_drifts_nor_grows_its_covariance() {
         moved.norm() < 1e-6
     };
     let standing: Vec<usize> = (1..truth.len()).filter(stands).collect();
-    assert!(standing.len() >= 5, "{standing:?}");
+    assert!(standing.len() >= 3, "{standing:?}");
     let (first, last) = (&rows[standing[0]], &rows[standing[standing.len() - 1]]);
     let moved =
         last.odom_from_camera.translation.vector - first.odom_from_camera.translation.vector;
@@ -141,19 +141,19 @@ fn ten_black_pairs_are_lost_with_an_honest_covariance_and_found_again() {
         "--trajectory",
         "circle",
         "--frames",
-        "30",
+        "22",
         "--blackout",
-        "12..22",
+        "8..18",
     ];
     let drive = Drive::new(&arguments);
     for row in &drive.run.rows {
         let expected = match row.sequence {
             0 => Initializing,
-            12..22 => Lost,
+            8..18 => Lost,
             _ => Tracking,
         };
         // After a loss a few pairs must agree before a status is good again.
-        let is_rising = (22..25).contains(&row.sequence) && row.status != Lost;
+        let is_rising = (18..21).contains(&row.sequence) && row.status != Lost;
         assert!(
             row.status == expected || is_rising,
             "{}: {:?}",
@@ -163,7 +163,7 @@ fn ten_black_pairs_are_lost_with_an_honest_covariance_and_found_again() {
         assert_eq!(row.epoch, drive.run.rows[0].epoch, "{}", row.sequence);
     }
     let errors_m = errors_m(&drive.run.rows, &drive.truth());
-    for row in &drive.run.rows[12..22] {
+    for row in &drive.run.rows[8..18] {
         let sigma_m = row.cov_pose.fixed_view::<3, 3>(0, 0).trace().sqrt();
         let error_m = errors_m[row.sequence as usize];
         assert!(
