@@ -6,6 +6,7 @@
 //! What is published is held against the truth of the instant that the left image shows. A motion or pose is
 //! *wrong* where its error is beyond its covariance's 5 σ, of all six coordinates together or along one axis.
 
+use super::images::{SEQUENCES, rendered};
 use super::world::RigDraw;
 use super::{MonteCarloError, RigError, Settings, for_each_run, rng_of_run};
 use crate::capture::StereoPair;
@@ -14,26 +15,19 @@ use crate::features::{self, Extractor};
 use crate::geometry::{StereoRig, se3};
 use crate::pipeline::{DescribedPair, Method};
 use crate::simulation::corruption::{Corruption, MAX_LAG, Material, Spoiler};
-use crate::simulation::{self, SceneName, Simulation, TrajectoryName};
+use crate::simulation::{SceneName, TrajectoryName};
 use crate::uncertainty::consistency::{chi2_quantile, nees};
 use nalgebra::{Isometry3, Matrix6, Vector6};
 use rand::RngExt;
 use std::fmt::Write;
 
-/// The sequences, one after the other.
-const SEQUENCES: [(SceneName, TrajectoryName); 9] = [
-    (SceneName::Hall, TrajectoryName::Slalom),
-    (SceneName::Corridor, TrajectoryName::Straight),
-    (SceneName::Hall, TrajectoryName::Circle),
-    (SceneName::Street, TrajectoryName::Straight),
-    (SceneName::Room, TrajectoryName::LoopRoom),
-    (SceneName::Hall, TrajectoryName::Arc),
+/// The sequences that come after the images stage's own.
+const MORE_SEQUENCES: [(SceneName, TrajectoryName); 3] = [
     (SceneName::Room, TrajectoryName::FastTurn),
     (SceneName::Corridor, TrajectoryName::StopAndGo),
     (SceneName::Repetitive, TrajectoryName::Slalom),
 ];
 const STAGE: u64 = 5;
-const RATE_HZ: f64 = 10.0;
 /// Features of an image and landmarks at most: fewer than by default, so that thousands of pairs take minutes.
 const FEATURES: usize = 400;
 const LANDMARKS: u32 = 120;
@@ -241,14 +235,9 @@ fn extractor() -> Option<Box<dyn Extractor>> {
 impl Film {
     fn new(seen: &StereoRig, run: u64, seed: u64) -> Option<Self> {
         let of = |run: u64| {
-            let (scene, trajectory) = SEQUENCES[(run % SEQUENCES.len() as u64) as usize];
-            let settings = simulation::Settings {
-                frames: PAIRS as u64,
-                rate_hz: RATE_HZ,
-                seed: seed.wrapping_add(run),
-                ..simulation::Settings::default()
-            };
-            Simulation::new(scene, trajectory, seen.clone(), settings).ok()
+            let sequences = [&SEQUENCES[..], &MORE_SEQUENCES].concat();
+            let sequence = sequences[(run % sequences.len() as u64) as usize];
+            rendered(sequence, seen.clone(), PAIRS as u64, seed.wrapping_add(run))
         };
         let simulation = of(run)?;
         let mut extractor = extractor()?;

@@ -124,22 +124,27 @@ pub fn run_images(
     })
 }
 
+/// A sequence of so many frames, as `seen` sees it.
+pub(super) fn rendered(
+    (scene, trajectory): (SceneName, TrajectoryName),
+    seen: StereoRig,
+    frames: u64,
+    seed: u64,
+) -> Option<Simulation> {
+    let settings = simulation::Settings {
+        frames,
+        rate_hz: RATE_HZ,
+        seed,
+        ..simulation::Settings::default()
+    };
+    Simulation::new(scene, trajectory, seen, settings).ok()
+}
+
 /// One sequence, seen by `seen`, followed by a pipeline that believes in `rig`.
 fn follow(rig: &StereoRig, seen: StereoRig, settings: &Settings, run: u64) -> Option<Run> {
     let (scene, trajectory) = SEQUENCES[(run % SEQUENCES.len() as u64) as usize];
     let seed = settings.seed.wrapping_add(run);
-    let simulation = Simulation::new(
-        scene,
-        trajectory,
-        seen,
-        simulation::Settings {
-            frames: settings.steps as u64 + 1,
-            rate_hz: RATE_HZ,
-            seed,
-            ..simulation::Settings::default()
-        },
-    )
-    .ok()?;
+    let simulation = rendered((scene, trajectory), seen, settings.steps as u64 + 1, seed)?;
     let mut extractor = features::extractor(&features::Settings::default()).ok()?;
     let mut method = Method::new(rig.clone(), Default::default(), settings.of_images())?;
     let mut judge = Judge::default();

@@ -190,24 +190,14 @@ impl<'a> Spoiler<'a> {
             Corruption::Frozen => take_images(&mut pair, &pairs[self.first - 1]),
             Corruption::FrozenSide => {
                 let frozen = &pairs[self.first - 1];
-                let image = if self.side == Side::Left {
-                    &frozen.left
-                } else {
-                    &frozen.right
-                };
-                side_of(&mut pair, self.side).clone_from(image);
+                take_side(&mut pair, frozen, self.side);
             }
             Corruption::Stale => {
                 take_images(&mut pair, &pairs[self.first - 1 - self.lag.unsigned_abs()])
             }
             Corruption::LateSide => {
                 let other = ago(self.lag);
-                let image = if self.side == Side::Left {
-                    &other.left
-                } else {
-                    &other.right
-                };
-                side_of(&mut pair, self.side).clone_from(image);
+                take_side(&mut pair, other, self.side);
                 self.renew(&mut pair);
             }
             Corruption::LateBoth => {
@@ -259,22 +249,14 @@ impl<'a> Spoiler<'a> {
                     [px * self.direction_rad.cos(), px * self.direction_rad.sin()].map(f64::round);
                 displace(side_of(&mut pair, self.side), by);
             }
-            Corruption::OtherPlace => take_images(&mut pair, self.material.other_place),
-            Corruption::OtherPlaceSide => {
-                let other = self.material.other_place;
-                let image = if self.side == Side::Left {
-                    &other.left
-                } else {
-                    &other.right
-                };
-                side_of(&mut pair, self.side).clone_from(image);
+            Corruption::OtherPlace => {
+                take_images(&mut pair, self.material.other_place);
+                self.renew(&mut pair);
             }
-        }
-        if matches!(
-            self.kind,
-            Corruption::OtherPlace | Corruption::OtherPlaceSide
-        ) {
-            self.renew(&mut pair);
+            Corruption::OtherPlaceSide => {
+                take_side(&mut pair, self.material.other_place, self.side);
+                self.renew(&mut pair);
+            }
         }
         Spoilt { pair, truth }
     }
@@ -421,6 +403,14 @@ fn fill_both(pair: &mut StereoPair, value: u8) {
 fn take_images(pair: &mut StereoPair, other: &StereoPair) {
     pair.left.clone_from(&other.left);
     pair.right.clone_from(&other.right);
+}
+
+/// Takes one image of another pair.
+fn take_side(pair: &mut StereoPair, other: &StereoPair, side: Side) {
+    match side {
+        Side::Left => pair.left.clone_from(&other.left),
+        Side::Right => pair.right.clone_from(&other.right),
+    }
 }
 
 fn displace(image: &mut GrayImage, [dx, dy]: [f64; 2]) {
