@@ -1,5 +1,8 @@
 //! A grey image: the only pixels that the stages see.
 
+/// Bands of rows that an image is told from others by.
+pub const BANDS: usize = 16;
+
 /// An 8-bit grey image, row-major without padding; pixel centres at integer coordinates.
 ///
 /// A colour or 16-bit source becomes one of these where it is decoded, so that every later stage
@@ -71,32 +74,16 @@ impl GrayImage {
         &self.data[y as usize * width..][..width]
     }
 
-    /// A number by which images that differ in any pixel differ, but for chance; `None` for an image of one
-    /// grey value, which says nothing of when it was taken.
+    /// Of each of [`BANDS`] bands of rows, from the top, a number by which bands that differ in any pixel differ,
+    /// but for chance; `None` for a band of one grey value, which says nothing of when it was taken.
     #[must_use]
-    pub fn fingerprint(&self) -> Option<u64> {
-        const LANES: usize = 4;
-        const ODD: u64 = 0x9E37_79B9_7F4A_7C15;
-        let mix = |hash: u64, word: u64| (hash ^ word).wrapping_mul(ODD).rotate_left(29);
-        let first = *self.data.first()?;
-        let mut lanes = [1_u64, 2, 3, 4];
-        let mut is_uniform = true;
-        let uniform = u64::from_ne_bytes([first; 8]);
-        // Lanes that do not wait for each other.
-        let mut blocks = self.data.chunks_exact(8 * LANES);
-        for block in &mut blocks {
-            for (lane, bytes) in lanes.iter_mut().zip(block.as_chunks::<8>().0) {
-                let word = u64::from_ne_bytes(*bytes);
-                is_uniform &= word == uniform;
-                *lane = mix(*lane, word);
-            }
-        }
-        for &byte in blocks.remainder() {
-            is_uniform &= byte == first;
-            lanes[0] = mix(lanes[0], u64::from(byte));
-        }
-        let size = (u64::from(self.width) << 32) | u64::from(self.height);
-        (!is_uniform).then(|| lanes.into_iter().fold(size, mix))
+    pub fn fingerprints(&self) -> [Option<u64>; BANDS] {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let from = |band: usize| band * height / BANDS * width;
+        std::array::from_fn(|band| {
+            let hash = fingerprint(&self.data[from(band)..from(band + 1)])?;
+            Some(mix(hash, self.width.into()))
+        })
     }
 
     /// Changes the size in place, keeping the allocation where it suffices; pixel values are
@@ -108,38 +95,72 @@ impl GrayImage {
     }
 }
 
+fn mix(hash: u64, word: u64) -> u64 {
+    const ODD: u64 = 0x9E37_79B9_7F4A_7C15;
+    (hash ^ word).wrapping_mul(ODD).rotate_left(29)
+}
+
+fn fingerprint(bytes: &[u8]) -> Option<u64> {
+    let first = *bytes.first()?;
+    let mut lanes = [1_u64, 2, 3, 4];
+    let mut is_uniform = true;
+    let uniform = u64::from_ne_bytes([first; 8]);
+    // Lanes that do not wait for each other.
+    let mut blocks = bytes.chunks_exact(8 * lanes.len());
+    for block in &mut blocks {
+        for (lane, bytes) in lanes.iter_mut().zip(block.as_chunks::<8>().0) {
+            let word = u64::from_ne_bytes(*bytes);
+            is_uniform &= word == uniform;
+            *lane = mix(*lane, word);
+        }
+    }
+    for &byte in blocks.remainder() {
+        is_uniform &= byte == first;
+        lanes[0] = mix(lanes[0], u64::from(byte));
+    }
+    (!is_uniform).then(|| lanes.into_iter().fold(bytes.len() as u64, mix))
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
 
     #[test]
-    fn fingerprints_tell_images_apart_by_any_pixel() {
+    fn fingerprints_tell_the_bands_apart_that_differ_in_any_pixel() {
+        let (width, height) = (35, 2 * BANDS);
         let image = |change: Option<usize>| {
-            let mut data: Vec<u8> = (0..35 * 7).map(|i| (i * 7 % 251) as u8).collect();
+            let grey = |i: usize| (i * 7 % 251) as u8;
+            let mut data: Vec<u8> = (0..width * height).map(grey).collect();
             if let Some(at) = change {
                 data[at] ^= 1;
             }
-            GrayImage::from_vec(35, 7, data).expect("the size fits")
+            GrayImage::from_vec(width as u32, height as u32, data).expect("the size fits")
         };
-        let of = |change| image(change).fingerprint();
-        assert_eq!(of(None), of(None));
-        for at in 0..35 * 7 {
-            assert_ne!(of(None), of(Some(at)), "{at}");
+        let of = |change| image(change).fingerprints();
+        assert!(of(None).iter().all(Option::is_some));
+        for at in 0..width * height {
+            let changed = of(Some(at));
+            for (band, (now, before)) in changed.iter().zip(of(None)).enumerate() {
+                assert_eq!(*now != before, band == at / (2 * width), "{at} {band}");
+            }
         }
-        let other_shape = GrayImage::from_vec(7, 35, image(None).into_vec());
-        assert_ne!(other_shape.and_then(|i| i.fingerprint()), of(None));
+        let other_shape = GrayImage::from_vec(70, BANDS as u32, image(None).into_vec());
+        let other_shape = other_shape.expect("the size fits").fingerprints();
+        assert!(other_shape.iter().zip(of(None)).all(|(a, b)| *a != b));
     }
 
     #[test]
-    fn an_image_of_one_grey_value_has_no_fingerprint() {
+    fn a_band_of_one_grey_value_has_no_fingerprint() {
         for size in [1, 31, 32, 33, 64] {
-            let mut image = GrayImage::filled(size, 1, 9);
-            assert_eq!(image.fingerprint(), None);
+            let mut image = GrayImage::filled(size, BANDS as u32, 9);
+            assert_eq!(image.fingerprints(), [None; BANDS]);
             if let Some(last) = image.pixels_mut().last_mut().filter(|_| size > 1) {
                 *last = 8;
-                assert!(image.fingerprint().is_some(), "{size}");
+                let of = image.fingerprints();
+                assert_eq!(of[..BANDS - 1], [None; BANDS - 1], "{size}");
+                assert!(of[BANDS - 1].is_some(), "{size}");
             }
         }
-        assert_eq!(GrayImage::default().fingerprint(), None);
+        assert_eq!(GrayImage::default().fingerprints(), [None; BANDS]);
     }
 }

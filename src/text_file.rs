@@ -77,6 +77,11 @@ pub(crate) fn one_line(text: &str, longest: usize) -> String {
     line
 }
 
+/// Whether a name may stand in a message as it is.
+pub(crate) fn is_one_line(name: &str) -> bool {
+    !name.contains(char::is_control)
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;

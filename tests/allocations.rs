@@ -11,7 +11,7 @@ mod memory;
 
 #[cfg(test)]
 mod tests {
-    use super::memory::Recording;
+    use super::memory::{self, Recording};
     use std::alloc::{GlobalAlloc, Layout, System};
     use std::cell::Cell;
     use std::collections::VecDeque;
@@ -22,12 +22,12 @@ mod tests {
     use visod::capture::{Dataset, PairEvent, PairSource, ReadAhead};
     use visod::features::{self, Extractor, Features};
     use visod::geometry::Rectification;
+    use visod::image::GrayImage;
     use visod::matching::{self, MatchedPair, StereoMatcher, TemporalMatcher};
     use visod::output::features::FeaturesMessage;
     use visod::output::message::CaptureTime;
     use visod::pipeline::{self, DescribedPair, Method};
     use visod::simulation::small_rig;
-    use visod::{estimation, image::GrayImage};
 
     /// The system's allocator, counting.
     struct Counting;
@@ -169,7 +169,7 @@ mod tests {
 
     fn method(recording: &Recording) -> Method {
         let rig = recording.rig.clone();
-        let (matching, estimation) = (Default::default(), estimation::Settings::default());
+        let (matching, estimation) = (Default::default(), memory::estimation());
         Method::new(rig, matching, estimation)
             .expect("side by side")
             .watching_rig(&visod::rig_watch::Settings::default())

@@ -1,5 +1,6 @@
 //! Two folders, or a recording, in; pairs of image files out.
 
+use crate::text_file;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
@@ -100,6 +101,12 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>, String> {
             continue;
         };
         if ENDINGS.contains(&ending.as_str()) && !name.starts_with('.') {
+            if !text_file::is_one_line(name) {
+                let name = text_file::shown(name);
+                return Err(fail(&format_args!(
+                    "the name of an image has a control character: \"{name}\""
+                )));
+            }
             images.push((name.to_owned(), file.clone()));
         }
     }

@@ -227,6 +227,12 @@ fn folders_without_images_or_common_names_are_refused() {
         refusal(&dir),
         "left/000001.png: has the same name as left/000001.pgm"
     );
+    let dir = own();
+    put(&dir, "left/000001\x1B[2J.pgm", "");
+    assert_eq!(
+        refusal(&dir),
+        "left: holds an image whose name has a control character: \"000001\u{FFFD}[2J\""
+    );
 }
 
 #[test]

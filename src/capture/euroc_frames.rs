@@ -97,7 +97,7 @@ fn is_plain_name(name: &str) -> bool {
         (parts.next(), parts.next()),
         (Some(Component::Normal(_)), None)
     );
-    single && !name.contains(['/', '\\', '\0'])
+    single && !name.contains(['/', '\\']) && text::is_one_line(name)
 }
 
 /// Pairs the images whose stamps are nearest to each other, both ways, within the tolerance.

@@ -155,6 +155,11 @@ pub(super) fn images_in(folder: &Path) -> Result<BTreeMap<Stem, PathBuf>, Datase
         let Some(stem) = Stem::of(&file) else {
             continue;
         };
+        if !text::is_one_line(&stem.name.to_string_lossy()) {
+            let name = text::shown(&stem.name.to_string_lossy());
+            let why = format!("holds an image whose name has a control character: \"{name}\"");
+            return Err(DatasetError::file(folder, why));
+        }
         if let Some(other) = images.insert(stem, file.clone()) {
             let [first, second] = if other < file {
                 [other, file]

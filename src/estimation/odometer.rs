@@ -197,7 +197,7 @@ impl Odometer {
             by_sources: carry * self.reference.by_sources + measured.by_sources,
             bridging: compounding::carry(&self.reference.bridging, &reference_from_now),
         };
-        self.go_on(stamp, now, measured, counts, true)
+        self.go_on(stamp, now, measured, counts)
     }
 
     /// Makes `now` the reference and the last row.
@@ -207,7 +207,6 @@ impl Odometer {
         now: Place,
         measured: &MeasuredMotion,
         counts: Counts,
-        agrees: bool,
     ) -> Odometry {
         let parts = self
             .errors
@@ -230,22 +229,15 @@ impl Odometer {
         self.last = now;
         self.reference_from_last = no_motion();
         let is_flat = measured.departure.is_none_or(|d| d <= FLAT_LIMIT);
-        let is_plausible = is_flat && is_possible && agrees;
+        let is_plausible = is_flat && is_possible;
         let status = self
             .standing
             .measured(measured.inliers, noise.innovation_ratio, is_plausible);
         self.row(stamp, status, &since_last, counts, noise)
     }
 
-    /// The row of a pair whose pose the window knows; the pair becomes the reference. `agreement` is the share of
-    /// what was recognised that agrees with it.
-    pub fn arrive(
-        &mut self,
-        stamp: PairStamp,
-        tracked: &Tracked,
-        counts: Counts,
-        agreement: f64,
-    ) -> Odometry {
+    /// The row of a pair whose pose the window knows; the pair becomes the reference.
+    pub fn arrive(&mut self, stamp: PairStamp, tracked: &Tracked, counts: Counts) -> Odometry {
         let place = Place {
             odom_from_camera: tracked.odom_from_now,
             timestamp_ns: stamp.timestamp_ns,
@@ -260,13 +252,7 @@ impl Odometer {
             inliers: tracked.inliers,
             departure: tracked.departure,
         };
-        self.go_on(
-            stamp,
-            place,
-            &measured,
-            counts,
-            agreement >= LEAST_AGREEMENT,
-        )
+        self.go_on(stamp, place, &measured, counts)
     }
 
     /// Where the last row stands, and how sure that is, bridges left out.
@@ -443,10 +429,6 @@ impl Noise {
         }
     }
 }
-
-/// The share of votes of recognised landmarks that a motion has to have. Below, the images show two motions, such as those
-/// of a body that fills the view or of images in two parts, and which is the robot's is a guess.
-const LEAST_AGREEMENT: f64 = 0.5;
 
 /// Normalised innovations squared that a noise model is rejected at: residuals of twice the σ that
 /// the pairs before lead to expect.

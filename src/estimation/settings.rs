@@ -94,8 +94,9 @@ pub struct Settings {
     pub max_speed_m_s: Option<f64>,
     /// The same of its turn rate. rad/s, 0.001 to 1000, default none.
     pub max_turn_rad_s: Option<f64>,
-    /// How many of a camera's last images are remembered: a pair with one that is the same to the byte is
-    /// refused, for the camera or its driver is frozen. 0 to 64, default 1; 0 takes whatever comes.
+    /// How many of a camera's last images are remembered: a pair with one that is the same to the byte, or of
+    /// which a quarter is, is refused, for the camera or its driver is frozen. 0 to 64, default 8; 0 takes
+    /// whatever comes.
     pub repeats: u32,
     /// Pairs without a measured motion that are bridged before the odometry frame begins anew. 0 to
     /// 10000, default 20.
@@ -129,7 +130,7 @@ impl Default for Settings {
             keyframe_parallax: 0.015,
             max_speed_m_s: None,
             max_turn_rad_s: None,
-            repeats: 1,
+            repeats: 8,
             max_bridged: 20,
             acceleration_m_s2: 2.0,
             angular_acceleration_rad_s2: 2.0,

@@ -33,9 +33,10 @@ const FEATURES: usize = 400;
 const LANDMARKS: u32 = 120;
 /// Pairs of a sequence.
 const PAIRS: usize = 48;
-/// Good pairs before the first corrupted one, and between two runs of them.
+/// Good pairs before the first corrupted one, and between two runs of them: what is handed on once more was then
+/// handed on before.
 const WARM_UP: usize = 8;
-const REST: [usize; 2] = [3, 8];
+const REST: [usize; 2] = [MAX_LAG + 1, 8];
 /// Corrupted pairs in a row at most.
 const LONGEST: usize = 5;
 /// Of a normal variable, the chance that it is beyond 5 σ.
@@ -111,7 +112,7 @@ pub struct Wrong {
 /// What corrupted pairs came to.
 #[derive(Clone, Debug, Default)]
 pub struct CorruptedOutcome {
-    /// Kind by kind, in the order of [`Corruption::ALL`].
+    /// Kind by kind, in the order that they were asked for.
     pub kinds: Vec<(Corruption, Tally)>,
     /// All rows that are wrong.
     pub wrong: Vec<Wrong>,
@@ -139,7 +140,10 @@ impl CorruptedOutcome {
              |---|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|--:|\n",
         );
         let total = ("all but none".to_owned(), self.total());
-        let kinds = self.kinds.iter().map(|(kind, tally)| (name(*kind), *tally));
+        let kinds = self
+            .kinds
+            .iter()
+            .map(|(kind, tally)| (kind.to_string(), *tally));
         for (name, t) in kinds.chain([total]) {
             let share = |i: usize| 100.0 * t.by_status[i] as f64 / t.corrupted.max(1) as f64;
             let anees = |sum: f64| sum / (6 * t.tracking).max(1) as f64;
@@ -166,21 +170,14 @@ impl CorruptedOutcome {
     }
 }
 
-/// The word for a kind.
-fn name(kind: Corruption) -> String {
-    serde_json::to_value(kind)
-        .ok()
-        .and_then(|word| word.as_str().map(str::to_owned))
-        .unwrap_or_default()
-}
-
-/// Follows `runs` sequences through every corruption. `rig` states its uncertainty, of which each sequence draws.
-/// `progress` hears of each sequence.
+/// Follows `runs` sequences through each corruption of `kinds`. `rig` states its uncertainty, of which each sequence
+/// draws. `progress` hears of each sequence.
 ///
 /// # Errors
 /// The rig states no uncertainty.
 pub fn run_corrupted(
     rig: &StereoRig,
+    kinds: &[Corruption],
     runs: u64,
     seed: u64,
     progress: &(dyn Fn(u64) + Sync),
@@ -193,7 +190,7 @@ pub fn run_corrupted(
         return Err(MonteCarloError::NoRigUncertainty);
     };
     let mut outcome = CorruptedOutcome {
-        kinds: Corruption::ALL.map(|kind| (kind, Tally::default())).into(),
+        kinds: kinds.iter().map(|kind| (*kind, Tally::default())).collect(),
         wrong: Vec::new(),
     };
     for_each_run(
@@ -201,9 +198,8 @@ pub fn run_corrupted(
         |run| {
             let seen = rigs.draw(rig, &mut rng_of_run(seed, STAGE, run));
             let film = Film::new(&seen, run, seed)?;
-            let all = Corruption::ALL.into_iter().enumerate();
-            all.map(|(i, kind)| film.follow(rig, kind, [seed ^ i as u64, run]))
-                .collect::<Option<Vec<_>>>()
+            let follow = |kind: &Corruption| film.follow(rig, *kind, [seed ^ *kind as u64, run]);
+            kinds.iter().map(follow).collect::<Option<Vec<_>>>()
         },
         progress,
         |_, tallies: Option<Vec<(Tally, Vec<Wrong>)>>| {

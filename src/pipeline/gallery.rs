@@ -85,6 +85,25 @@ impl Gallery {
         }
     }
 
+    /// Takes note of which landmarks the present pair shows and which it should.
+    pub(super) fn grow_older(&mut self) {
+        for portrait in &mut self.portraits {
+            portrait.age += u32::from(portrait.found);
+            portrait.missed = if portrait.found {
+                0
+            } else {
+                portrait.missed + 1
+            };
+        }
+    }
+
+    /// A motion that proves not to be the robot's says nothing of those that did not agree with it.
+    pub(super) fn forget_doubts(&mut self) {
+        for portrait in &mut self.portraits {
+            portrait.disagreed = false;
+        }
+    }
+
     /// Drops the landmarks that `keep` does not want.
     pub(super) fn retain(&mut self, mut keep: impl FnMut(&Portrait) -> bool) {
         let mut kept = 0;

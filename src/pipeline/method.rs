@@ -14,7 +14,7 @@ use crate::estimation::{
 };
 use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
-use crate::image::GrayImage;
+use crate::image::{BANDS, GrayImage};
 use crate::matching::{
     self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
 };
@@ -32,15 +32,15 @@ pub struct Described {
     pub features: Features,
     /// Its reductions.
     pub pyramid: Pyramid,
-    /// What tells it from other images; `None` for one that says nothing.
-    pub fingerprint: Option<u64>,
+    /// What tells its bands of rows from those of other images; `None` for one that says nothing.
+    pub fingerprints: [Option<u64>; BANDS],
 }
 
 impl Described {
     /// Takes on what needs no extractor.
     pub fn take(&mut self, image: &GrayImage) {
         self.pyramid.fill(image);
-        self.fingerprint = image.fingerprint();
+        self.fingerprints = image.fingerprints();
     }
 }
 
@@ -205,7 +205,7 @@ impl Method {
     /// Takes the next pair and says where the camera is.
     ///
     /// # Errors
-    /// An image is one that the camera has shown before, or its features could not be matched. The method stands
+    /// An image, or a good part of it, is one that the camera has shown before, or its features could not be matched. The method stands
     /// as before the pair, which is then to be [skipped](Self::skip).
     pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, StepError> {
         self.has_stepped = false;

@@ -1,40 +1,48 @@
 //! Images in; whether a camera shows what it has shown before.
 //!
-//! No two images of a sensor are the same to the byte: where they are, the camera or its driver hands on an old
-//! one under a new stamp. Such a pair would give a pose that is exact, sure of itself, and of another time.
+//! No two images of a sensor are the same to the byte, not in a band of their rows: where they are, the camera or
+//! its driver hands on an old one, or half of one, under a new stamp. Such a pair would give a pose that is exact,
+//! sure of itself, and of another time.
 
 use super::method::DescribedPair;
-use crate::capture::Side;
+use crate::image::BANDS;
 
 /// Images that are remembered at most.
 const MOST: usize = 64;
+/// As many bands of one old image make an image old. A few may be alike by chance: of a sky without a shade but for
+/// the one wire before it.
+const OLD_BANDS: usize = BANDS / 4;
+
+/// Fingerprints of an image's bands.
+type Prints = [Option<u64>; BANDS];
 
 /// The last images of both cameras, by their fingerprints.
 #[derive(Debug)]
 pub(super) struct Repeats {
     remembered: usize,
-    last: [[Option<u64>; MOST]; 2],
+    last: [[Prints; MOST]; 2],
     next: usize,
 }
 
 /// A camera hands on what it has handed on before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{} one that was there before, to the byte: a camera or its driver is frozen", .0.words())]
-pub struct Repeated(Whose);
-
-/// Whose image it is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Whose {
-    One(Side),
-    Both,
+#[error("{} there before, to the byte: a camera or its driver hands on what is old", self.words())]
+pub struct Repeated {
+    /// How many bands are old, of each camera's image.
+    old: [usize; 2],
+    /// Whether nothing else is in it.
+    whole: [bool; 2],
 }
 
-impl Whose {
-    fn words(self) -> &'static str {
-        match self {
-            Self::One(Side::Left) => "the left image is",
-            Self::One(Side::Right) => "the right image is",
-            Self::Both => "each image is",
+impl Repeated {
+    fn words(&self) -> &'static str {
+        match (self.old, self.whole) {
+            ([_, 0], [true, _]) => "the left image was",
+            ([_, 0], _) => "a part of the left image was",
+            ([0, _], [_, true]) => "the right image was",
+            ([0, _], _) => "a part of the right image was",
+            (_, [true, true]) => "each image was",
+            _ => "a part of each image was",
         }
     }
 }
@@ -44,32 +52,40 @@ impl Repeats {
     pub(super) fn new(remembered: u32) -> Self {
         Self {
             remembered: (remembered as usize).min(MOST),
-            last: [[None; MOST]; 2],
+            last: [[[None; BANDS]; MOST]; 2],
             next: 0,
         }
     }
 
-    /// Refuses a pair of which one image was there before; remembers both.
+    /// Refuses a pair of which an image, or a good part of one, was there before; remembers both.
     pub(super) fn check(&mut self, pair: &DescribedPair) -> Result<(), Repeated> {
-        let now = [pair.left.fingerprint, pair.right.fingerprint];
         if self.remembered == 0 {
             return Ok(());
         }
-        let is_old = |side: usize| {
-            now[side].is_some() && self.last[side][..self.remembered].contains(&now[side])
-        };
-        let repeated = match [is_old(0), is_old(1)] {
-            [false, false] => Ok(()),
-            [true, false] => Err(Repeated(Whose::One(Side::Left))),
-            [false, true] => Err(Repeated(Whose::One(Side::Right))),
-            [true, true] => Err(Repeated(Whose::Both)),
-        };
+        let now = [&pair.left.fingerprints, &pair.right.fingerprints];
+        let told = now.map(|now| now.iter().flatten().count());
+        let old = [0, 1].map(|side| {
+            let last = self.last[side][..self.remembered].iter();
+            let old = last.map(|last| in_common(now[side], last)).max();
+            old.filter(|old| *old >= told[side].clamp(1, OLD_BANDS))
+                .unwrap_or(0)
+        });
         for (last, now) in self.last.iter_mut().zip(now) {
-            last[self.next] = now;
+            last[self.next] = *now;
         }
         self.next = (self.next + 1) % self.remembered;
-        repeated
+        if old == [0, 0] {
+            return Ok(());
+        }
+        let whole = [old[0] == told[0], old[1] == told[1]];
+        Err(Repeated { old, whole })
     }
+}
+
+/// How many bands of two images are the same.
+fn in_common(one: &Prints, other: &Prints) -> usize {
+    let same = |(a, b): &(&Option<u64>, &Option<u64>)| a.is_some() && a == b;
+    one.iter().zip(other).filter(same).count()
 }
 
 #[cfg(test)]
@@ -77,10 +93,15 @@ mod tests {
     use super::*;
     use proptest::prelude::*;
 
-    fn pair(left: u64, right: u64) -> DescribedPair {
+    /// An image whose bands are all of one kind, 0 for those that say nothing.
+    fn image(kind: u64) -> Prints {
+        [(kind > 0).then_some(kind); BANDS]
+    }
+
+    fn pair(left: Prints, right: Prints) -> DescribedPair {
         let mut pair = DescribedPair::default();
-        pair.left.fingerprint = (left > 0).then_some(left);
-        pair.right.fingerprint = (right > 0).then_some(right);
+        pair.left.fingerprints = left;
+        pair.right.fingerprints = right;
         pair
     }
 
@@ -94,27 +115,53 @@ mod tests {
             for (i, &(left, right)) in images.iter().enumerate() {
                 let before = &images[i.saturating_sub(remembered as usize)..i];
                 let is_old = before.iter().any(|&(l, r)| (left > 0 && l == left) || (right > 0 && r == right));
-                prop_assert_eq!(repeats.check(&pair(left, right)).is_err(), is_old);
+                prop_assert_eq!(repeats.check(&pair(image(left), image(right))).is_err(), is_old);
             }
+        }
+
+        #[test]
+        fn a_quarter_that_is_old_is_refused_and_so_is_all_that_says_anything(
+            old in prop::collection::vec(any::<bool>(), BANDS),
+            dark in prop::collection::vec(any::<bool>(), BANDS),
+        ) {
+            let mut repeats = Repeats::new(2);
+            prop_assert!(repeats.check(&pair(image(1), image(2))).is_ok());
+            prop_assert!(repeats.check(&pair(image(3), image(4))).is_ok());
+            let kind = |band: usize| (!dark[band]).then_some(if old[band] { 1 } else { 5 });
+            let now: Prints = std::array::from_fn(kind);
+            let told = now.iter().flatten().count();
+            let repeated = now.iter().flatten().filter(|kind| **kind == 1).count();
+            let is_old = repeated >= BANDS / 4 || (repeated == told && told > 0);
+            prop_assert_eq!(repeats.check(&pair(now, image(6))).is_err(), is_old);
         }
     }
 
     #[test]
     fn the_refusal_names_the_camera() {
-        let say = |now: [u64; 2]| {
+        let say = |left: Prints, right: Prints| {
             let mut repeats = Repeats::new(1);
-            assert_eq!(repeats.check(&pair(1, 2)), Ok(()));
-            repeats
-                .check(&pair(now[0], now[1]))
-                .map_err(|e| e.to_string())
+            assert_eq!(repeats.check(&pair(image(1), image(2))), Ok(()));
+            repeats.check(&pair(left, right)).map_err(|e| e.to_string())
         };
-        assert_eq!(say([3, 4]), Ok(()));
-        for (now, words) in [
-            ([1, 4], "the left image is"),
-            ([3, 2], "the right image is"),
-            ([1, 2], "each image is"),
+        let half = |kind: u64| {
+            let mut half = image(kind);
+            half[BANDS / 2..].fill(Some(9));
+            half
+        };
+        assert_eq!(say(image(3), image(4)), Ok(()));
+        for (left, right, words) in [
+            (image(1), image(4), "the left image was there"),
+            (image(3), image(2), "the right image was there"),
+            (image(1), image(2), "each image was there"),
+            (half(1), image(4), "a part of the left image was there"),
+            (image(3), half(2), "a part of the right image was there"),
+            (half(1), image(2), "a part of each image was there"),
         ] {
-            assert!(say(now).is_err_and(|e| e.starts_with(words)));
+            let said = say(left, right);
+            assert!(
+                said.as_ref().is_err_and(|e| e.starts_with(words)),
+                "{said:?}"
+            );
         }
     }
 }

@@ -26,6 +26,18 @@ const RIGHT_REACH_PX: f64 = 3.0;
 const MAX_MISSED: u32 = 2;
 /// New landmarks in a cell of the image at most, old ones included.
 const MOST_IN_A_CELL: u32 = 8;
+/// Pairs after which a landmark's vote counts in full: what has stood still for long has more of a say than what has
+/// just come into view.
+const SENIORITY: u32 = 4;
+/// The share of the votes of recognised landmarks that a motion has to have. Below, the images show two motions, such
+/// as those of a body that fills the view or of images in two parts, and which is the robot's is a guess.
+const LEAST_AGREEMENT: f64 = 0.5;
+/// The share above which the others' votes do not matter.
+const CLEAR_AGREEMENT: f64 = 0.8;
+/// The share of the others' votes that makes a second motion of them.
+const COHERENT: f64 = 0.6;
+/// The share of the old landmarks that should be in view that has to be found.
+const QUORUM: f64 = 0.1;
 /// Sights that may prove wrong before a landmark is given up.
 const MAX_WRONG: u32 = 1;
 
@@ -42,10 +54,13 @@ pub(super) struct Windowed {
     /// The same, what the right camera saw being unsure.
     unsure: Vec<window::Seen>,
     weights: Vec<f64>,
+    /// Those of `seen` that do not agree with the motion, what their votes count, and those of them that agree with
+    /// each other.
+    others: Vec<window::Seen>,
+    others_weights: Vec<f64>,
+    others_agreed: Vec<u32>,
     /// Indices of those of `seen` that agree with the motion.
     agreed: Vec<u32>,
-    /// The share of the votes of recognised landmarks that are for the motion.
-    agreement: f64,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
     /// Whether a stereo match of the present pair shows a landmark that is known.
@@ -70,8 +85,10 @@ impl Windowed {
             seen: Vec::new(),
             unsure: Vec::new(),
             weights: Vec::new(),
+            others: Vec::new(),
+            others_weights: Vec::new(),
+            others_agreed: Vec::new(),
             agreed: Vec::new(),
-            agreement: 0.0,
             matches: Vec::new(),
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
@@ -126,12 +143,19 @@ impl Windowed {
         predicted: &Isometry3<f64>,
         stamp: PairStamp,
     ) -> Odometry {
+        // A first motion is sought far around, where much is found that does not belong together.
+        let must_convince = odometer.has_velocity();
         let consent = self
-            .consent(bench, predicted, stamp.sequence)
+            .consent(bench, predicted, stamp.sequence, must_convince)
             .filter(|motion| odometer.is_possible(motion, stamp.timestamp_ns));
         let tracked = consent.and_then(|newest_from_now| {
             self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());
+            if must_convince && !self.are_seniors_there(bench) {
+                self.gallery.forget_doubts();
+                return None;
+            }
+            self.gallery.grow_older();
             self.window.add(&newest_from_now, &self.seen);
             self.window.expose(&bench.exposure);
             self.window.adjust()
@@ -143,13 +167,7 @@ impl Windowed {
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
-        // A first motion is sought far around, where much is found that does not belong together.
-        let agreement = if odometer.has_velocity() {
-            self.agreement
-        } else {
-            1.0
-        };
-        let row = odometer.arrive(stamp, &tracked, counts, agreement);
+        let row = odometer.arrive(stamp, &tracked, counts);
         if self.wants_keyframe(bench) {
             self.promote(bench);
         }
@@ -243,12 +261,14 @@ impl Windowed {
 
     /// Seeks the patch of every recognised landmark near where the detector saw it, and finds the
     /// motion that they agree on: a patch's place is so sure that what moves by itself stands out.
-    /// Each part of the image has one vote, or a body of rich texture would outvote the world.
+    /// Each part of the image has one vote, or a body of rich texture would outvote the world. `must_convince`: none
+    /// is found of which it is doubtful whether it is the robot's.
     fn consent(
         &mut self,
         bench: &mut Workbench,
         predicted: &Isometry3<f64>,
         sequence: u64,
+        must_convince: bool,
     ) -> Option<Isometry3<f64>> {
         self.seen.clear();
         self.matches.clear();
@@ -276,11 +296,7 @@ impl Windowed {
                 relief_px: found.relief_px,
             });
         }
-        self.weights.clear();
-        let seen = self.seen.iter();
-        self.weights.extend(
-            seen.map(|s| 1.0 / f64::from(self.occupancy.count(&s.measurement.left_px()).max(1))),
-        );
+        self.weigh(bench);
         let seed = bench.estimation.seed ^ sequence;
         let mut newest_from_now =
             self.window
@@ -291,16 +307,55 @@ impl Windowed {
                     .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
         }
         let newest_from_now = newest_from_now?;
-        self.agreement = self.share_of_agreed();
+        if must_convince && !self.is_convincing(predicted, seed) {
+            return None;
+        }
         self.take_note(bench);
         Some(newest_from_now)
     }
 
-    /// Each part of the image has one vote here, too.
+    /// Whether the motion that `agreed` is for is the robot's, as far as the landmarks tell.
+    fn is_convincing(&mut self, predicted: &Isometry3<f64>, seed: u64) -> bool {
+        let share = self.share_of_agreed();
+        share >= LEAST_AGREEMENT
+            && (share >= CLEAR_AGREEMENT || !self.do_others_agree(predicted, seed))
+    }
+
+    /// Whether those that do not agree agree with each other: the images then show two motions.
+    fn do_others_agree(&mut self, predicted: &Isometry3<f64>, seed: u64) -> bool {
+        self.others.clear();
+        self.others_weights.clear();
+        let mut agreed = self.agreed.iter().peekable();
+        for (i, (seen, weight)) in (0..).zip(self.seen.iter().zip(&self.weights)) {
+            if agreed.next_if(|&&next| next == i).is_none() {
+                self.others.push(*seen);
+                self.others_weights.push(*weight);
+            }
+        }
+        let motion = self.window.consent(
+            &self.others,
+            &self.others_weights,
+            predicted,
+            seed,
+            &mut self.others_agreed,
+        );
+        motion.is_some() && share_of(&self.others_agreed, &self.others_weights) >= COHERENT
+    }
+
+    /// How much of a say each of `seen` has.
+    fn weigh(&mut self, bench: &Workbench) {
+        self.weights.clear();
+        let seen = self.seen.iter().zip(&self.matches);
+        self.weights.extend(seen.map(|(seen, &track)| {
+            let portrait = &self.gallery.portraits[bench.tracks[track].before as usize];
+            let in_its_part = self.occupancy.count(&seen.measurement.left_px()).max(1);
+            f64::from((1 + portrait.age).min(SENIORITY)) / f64::from(in_its_part)
+        }));
+    }
+
+    /// The share of the votes that are for the motion.
     fn share_of_agreed(&self) -> f64 {
-        let agreed: f64 = self.agreed.iter().map(|&i| self.weights[i as usize]).sum();
-        let all: f64 = self.weights.iter().sum();
-        agreed / all.max(f64::MIN_POSITIVE)
+        share_of(&self.agreed, &self.weights)
     }
 
     /// Has the watch on the rig look at the landmarks that agree with a motion. Where none was found, the right
@@ -406,14 +461,20 @@ impl Windowed {
                 });
             }
         }
-        for portrait in &mut self.gallery.portraits {
-            portrait.age += u32::from(portrait.found);
-            portrait.missed = if portrait.found {
-                0
-            } else {
-                portrait.missed + 1
-            };
+    }
+
+    /// Whether old landmarks were found where the motion puts them, if there should be some: where something new hides
+    /// the world or outshines it, they are not.
+    fn are_seniors_there(&self, bench: &Workbench) -> bool {
+        let expected = self.gallery.portraits.iter().zip(&bench.predicted);
+        let (mut found, mut all) = (0.0, 0.0);
+        for (portrait, px) in expected {
+            if portrait.age >= SENIORITY && px.is_some_and(|px| is_inside(&bench.rig, &px)) {
+                all += 1.0;
+                found += f64::from(u8::from(portrait.found));
+            }
         }
+        found >= QUORUM * all
     }
 
     /// Where a landmark's patch is in the present pair, near `start`.
@@ -590,6 +651,12 @@ impl Windowed {
             None => self.spare_images.pop().unwrap_or_default(),
         }
     }
+}
+
+/// The share of all votes that those of `agreed` have.
+fn share_of(agreed: &[u32], weights: &[f64]) -> f64 {
+    let votes: f64 = agreed.iter().map(|&i| weights[i as usize]).sum();
+    votes / weights.iter().sum::<f64>().max(f64::MIN_POSITIVE)
 }
 
 /// A measurement as it would have been without the displacement `late`, px, that the skew of the

@@ -7,6 +7,7 @@ use crate::image::GrayImage;
 use rand::RngExt;
 use rand_distr::StandardNormal;
 use rand_xoshiro::Xoshiro256PlusPlus;
+use serde::Serialize;
 
 /// What has gone wrong with a run of consecutive pairs.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, serde::Deserialize, serde::Serialize)]
@@ -42,6 +43,8 @@ pub enum Corruption {
     HalfOld,
     /// The lower part of one image is still that of the pair before.
     HalfOldSide,
+    /// The lower part of both images comes one pair late, and is not handed on twice.
+    HalfLate,
     /// The lower part of both images is black.
     HalfBlack,
     /// The lower part of one image is displaced along its rows, as by lost bytes.
@@ -68,7 +71,7 @@ pub enum Corruption {
 
 impl Corruption {
     /// Every one.
-    pub const ALL: [Self; 26] = [
+    pub const ALL: [Self; 27] = [
         Self::None,
         Self::Blur,
         Self::Black,
@@ -84,6 +87,7 @@ impl Corruption {
         Self::Noise,
         Self::HalfOld,
         Self::HalfOldSide,
+        Self::HalfLate,
         Self::HalfBlack,
         Self::Torn,
         Self::Bands,
@@ -96,6 +100,12 @@ impl Corruption {
         Self::OtherPlace,
         Self::OtherPlaceSide,
     ];
+}
+
+impl std::fmt::Display for Corruption {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        self.serialize(f)
+    }
 }
 
 /// The good pairs that a run of spoilt ones is made from.
@@ -174,7 +184,7 @@ impl<'a> Spoiler<'a> {
         let pairs = self.material.pairs;
         let mut pair = pairs[index].clone();
         let mut truth = index;
-        let before = &pairs[index - 1];
+        let last_whole = &pairs[self.first - 1];
         let ago = |lag: isize| &pairs[index.saturating_add_signed(-lag).min(pairs.len() - 1)];
         match self.kind {
             Corruption::None => {}
@@ -187,11 +197,8 @@ impl<'a> Spoiler<'a> {
                 truth = self.first + self.count - 1 - (index - self.first);
                 pair.clone_from(&pairs[truth]);
             }
-            Corruption::Frozen => take_images(&mut pair, &pairs[self.first - 1]),
-            Corruption::FrozenSide => {
-                let frozen = &pairs[self.first - 1];
-                take_side(&mut pair, frozen, self.side);
-            }
+            Corruption::Frozen => take_images(&mut pair, last_whole),
+            Corruption::FrozenSide => take_side(&mut pair, last_whole, self.side),
             Corruption::Stale => {
                 take_images(&mut pair, &pairs[self.first - 1 - self.lag.unsigned_abs()])
             }
@@ -209,13 +216,21 @@ impl<'a> Spoiler<'a> {
                 let sigma = 10.0 + 50.0 * self.strength;
                 self.on_both(&mut pair, |s, image| s.noise(image, sigma));
             }
-            Corruption::HalfOld | Corruption::HalfOldSide => {
-                if self.kind == Corruption::HalfOld || self.side == Side::Left {
-                    self.lower_part(&mut pair.left, |row| before.left.row(row));
-                }
-                if self.kind == Corruption::HalfOld || self.side == Side::Right {
-                    self.lower_part(&mut pair.right, |row| before.right.row(row));
-                }
+            Corruption::HalfOld | Corruption::HalfLate => {
+                let old = if self.kind == Corruption::HalfOld {
+                    last_whole
+                } else {
+                    &pairs[index - 1]
+                };
+                self.lower_part(&mut pair.left, |row| old.left.row(row));
+                self.lower_part(&mut pair.right, |row| old.right.row(row));
+            }
+            Corruption::HalfOldSide => {
+                let old = match self.side {
+                    Side::Left => &last_whole.left,
+                    Side::Right => &last_whole.right,
+                };
+                self.lower_part(side_of(&mut pair, self.side), |row| old.row(row));
             }
             Corruption::HalfBlack => {
                 let black = vec![0; pair.left.width() as usize];
@@ -233,7 +248,10 @@ impl<'a> Spoiler<'a> {
                 }
             }
             Corruption::Bands => self.on_both(&mut pair, Self::bands),
-            Corruption::Mover | Corruption::Cover => self.cover(&mut pair, index),
+            Corruption::Mover | Corruption::Cover => {
+                self.cover(&mut pair, index);
+                self.renew(&mut pair);
+            }
             Corruption::Exposure => self.on_both(&mut pair, Self::expose),
             Corruption::ExposureSide => {
                 let side = self.side;

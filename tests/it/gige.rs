@@ -196,7 +196,7 @@ impl Rig {
              [camera.left]\nid = \"Aravis-Fake-LEFT\"\nframe_rate_hz = {rate_hz:?}\n{left}\n\
              [camera.right]\nid = \"127.0.0.2\"\nframe_rate_hz = {rate_hz:?}\n\
              [capture]\npatience_s = 0.0\n{more}\n\
-             [features.surf]\nbudget = 200\n{publish}",
+             [features.surf]\nbudget = 200\n[estimation]\nrepeats = 1\n{publish}",
             self.path().join("rig.toml").display()
         );
         let file = folder.join("visod.toml");

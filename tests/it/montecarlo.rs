@@ -143,7 +143,7 @@ fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
         }),
         ..visod::simulation::small_rig()
     };
-    let outcome = visod::montecarlo::run_corrupted(&rig, 1, 1, &|_| {}).unwrap();
+    let outcome = visod::montecarlo::run_corrupted(&rig, &Corruption::ALL, 1, 1, &|_| {}).unwrap();
     println!("{}", outcome.to_table());
     assert!(outcome.total().corrupted > 200);
     for (kind, tally) in &outcome.kinds {

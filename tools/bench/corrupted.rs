@@ -1,14 +1,15 @@
-//! What is published of corrupted pairs, and whether it is right: `cargo bench --bench corrupted [SEQUENCES] [SEED]`.
+//! What is published of corrupted pairs, and whether it is right: `cargo bench --bench corrupted [SEQUENCES [SEED [WORD…]]]`.
 //!
 //! Rendered sequences through the whole pipeline, once for every kind of corruption: black, frozen or torn images,
 //! swapped cameras, wrong order, noise and so on. 45 sequences hold more than 10,000 corrupted pairs; the word `rows`
-//! prints every row that is wrong.
+//! prints every row that is wrong, other words, such as `mover`, name the kinds that are run.
 
 mod common;
 
 use visod::estimation::Odometry;
 use visod::geometry::{RigUncertainty, StereoRig};
 use visod::montecarlo::run_corrupted;
+use visod::simulation::corruption::Corruption;
 use visod::simulation::small_rig;
 
 /// Sequences where none are asked for.
@@ -22,9 +23,13 @@ fn main() {
             .and_then(|word| word.parse().ok())
             .unwrap_or(or)
     };
-    let outcome = match run_corrupted(&rig(), number(0, SEQUENCES), number(1, 1), &|_| {
-        eprint!(".")
-    }) {
+    let named = |kind: &Corruption| words.iter().any(|word| *word == kind.to_string());
+    let mut kinds: Vec<Corruption> = Corruption::ALL.into_iter().filter(named).collect();
+    if kinds.is_empty() {
+        kinds.extend(Corruption::ALL);
+    }
+    let (sequences, seed) = (number(0, SEQUENCES), number(1, 1));
+    let outcome = match run_corrupted(&rig(), &kinds, sequences, seed, &|_| eprint!(".")) {
         Ok(outcome) => outcome,
         Err(e) => unreachable!("the rig states its uncertainty: {e}"),
     };

@@ -8,7 +8,7 @@
 
 mod common;
 
-use common::memory::{Recording, ToAndFro};
+use common::memory::{Recording, ToAndFro, estimation};
 use common::{memory_mb, ms, process_time, thread_time, words};
 use std::convert::Infallible;
 use std::ops::ControlFlow;
@@ -69,7 +69,7 @@ impl Run {
         workers: usize,
         mut see: impl FnMut(usize),
     ) -> Self {
-        let (matching, estimation) = (Default::default(), Default::default());
+        let (matching, estimation) = (Default::default(), estimation());
         let Some(mut method) = Method::new(rig.clone(), matching, estimation) else {
             unreachable!("the cameras stand side by side")
         };
@@ -188,7 +188,7 @@ fn division() {
 
 /// What each pair took in features, reductions, matching and estimation, ms.
 fn divided(recording: &Recording) -> [Vec<f64>; 4] {
-    let (matching, estimation) = (Default::default(), Default::default());
+    let (matching, estimation) = (Default::default(), estimation());
     let Some(mut method) = Method::new(recording.rig.clone(), matching, estimation) else {
         unreachable!("the cameras stand side by side")
     };

@@ -74,6 +74,7 @@ impl Daemon {
         let camera = |side| format!("[camera.{side}]\ndriver = \"files\"\nid = \"{recording}\"\n");
         let config = format!(
             "rig = \"{recording}/rig.toml\"\n{}{}\
+             [estimation]\nrepeats = 1\n\
              [publish]\nroot = \"{}\"\nprefix = \"visod_bench_\"\n{more}",
             camera("left"),
             camera("right"),

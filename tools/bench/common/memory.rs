@@ -68,6 +68,14 @@ impl Recording {
     }
 }
 
+/// The estimator's defaults, but that pairs may come again after the next one, where a source turns.
+pub fn estimation() -> visod::estimation::Settings {
+    visod::estimation::Settings {
+        repeats: 1,
+        ..Default::default()
+    }
+}
+
 fn to_and_fro(place: u64, len: usize) -> usize {
     let period = (2 * len - 2).max(1);
     let at = place as usize % period;
