@@ -170,6 +170,12 @@ impl Odometer {
         )
     }
 
+    /// Whether the motion up to the last row was not measured.
+    #[must_use]
+    pub fn is_bridging(&self) -> bool {
+        self.bridged > 0
+    }
+
     /// Whether any motion has been measured since the odometry frame began.
     #[must_use]
     pub fn has_tracked(&self) -> bool {

@@ -37,7 +37,7 @@ const CLEAR_AGREEMENT: f64 = 0.8;
 /// The share of the others' votes that makes a second motion of them.
 const COHERENT: f64 = 0.6;
 /// The share of the old landmarks that should be in view that has to be found.
-const QUORUM: f64 = 0.1;
+const QUORUM: f64 = 0.2;
 /// Sights that may prove wrong before a landmark is given up.
 const MAX_WRONG: u32 = 1;
 
@@ -63,6 +63,9 @@ pub(super) struct Windowed {
     agreed: Vec<u32>,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
+    /// Whether landmarks were found where the pair before led to expect them. Far around, or after a bridge, much is
+    /// found that does not belong together.
+    are_where_expected: bool,
     /// Whether a stereo match of the present pair shows a landmark that is known.
     is_known: Vec<bool>,
     occupancy: Occupancy,
@@ -90,6 +93,7 @@ impl Windowed {
             others_agreed: Vec::new(),
             agreed: Vec::new(),
             matches: Vec::new(),
+            are_where_expected: false,
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
             candidates: Vec::new(),
@@ -143,15 +147,13 @@ impl Windowed {
         predicted: &Isometry3<f64>,
         stamp: PairStamp,
     ) -> Odometry {
-        // A first motion is sought far around, where much is found that does not belong together.
-        let must_convince = odometer.has_velocity();
         let consent = self
-            .consent(bench, predicted, stamp.sequence, must_convince)
+            .consent(bench, predicted, stamp.sequence)
             .filter(|motion| odometer.is_possible(motion, stamp.timestamp_ns));
         let tracked = consent.and_then(|newest_from_now| {
             self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());
-            if must_convince && !self.are_seniors_there(bench) {
+            if !self.are_seniors_there(bench) {
                 self.gallery.forget_doubts();
                 return None;
             }
@@ -164,6 +166,7 @@ impl Windowed {
             return self.bridge(bench, odometer, stamp);
         };
         self.holds_present = true;
+        self.take_looks(bench);
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
@@ -225,9 +228,11 @@ impl Windowed {
     ) -> Result<(), MatchError> {
         self.predict(bench, newest_from_now);
         let wide_px = bench.matching.wide_search * f64::from(bench.rig.left.width);
+        self.are_where_expected = false;
         if odometer.has_velocity() {
             self.find_tracks(bench, bench.matching.search_radius_px)?;
             if bench.tracks.len() >= bench.estimation.good_inliers as usize {
+                self.are_where_expected = !odometer.is_bridging();
                 return Ok(());
             }
         }
@@ -261,14 +266,13 @@ impl Windowed {
 
     /// Seeks the patch of every recognised landmark near where the detector saw it, and finds the
     /// motion that they agree on: a patch's place is so sure that what moves by itself stands out.
-    /// Each part of the image has one vote, or a body of rich texture would outvote the world. `must_convince`: none
-    /// is found of which it is doubtful whether it is the robot's.
+    /// Each part of the image has one vote, or a body of rich texture would outvote the world. None is found where it
+    /// is doubtful whose it is.
     fn consent(
         &mut self,
         bench: &mut Workbench,
         predicted: &Isometry3<f64>,
         sequence: u64,
-        must_convince: bool,
     ) -> Option<Isometry3<f64>> {
         self.seen.clear();
         self.matches.clear();
@@ -307,7 +311,7 @@ impl Windowed {
                     .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
         }
         let newest_from_now = newest_from_now?;
-        if must_convince && !self.is_convincing(predicted, seed) {
+        if self.are_where_expected && !self.is_convincing(predicted, seed) {
             return None;
         }
         self.take_note(bench);
@@ -429,11 +433,19 @@ impl Windowed {
             portrait.disagreed = false;
             portrait.found = true;
             self.is_known[track.now as usize] = true;
-            let (pair, m) = (&bench.now.pair, bench.now.matches[track.now as usize]);
-            self.gallery.recognised(track.before as usize, pair, m);
             self.seen[kept] = self.seen[i as usize];
         }
         self.seen.truncate(self.agreed.len());
+    }
+
+    /// Takes note of how the recognised landmarks look in the present pair.
+    fn take_looks(&mut self, bench: &Workbench) {
+        for &i in &self.agreed {
+            let track = bench.tracks[self.matches[i as usize]];
+            let m = bench.now.matches[track.now as usize];
+            self.gallery
+                .recognised(track.before as usize, &bench.now.pair, m);
+        }
     }
 
     /// Seeks the landmarks that the detector has missed where the motion puts them, and adds what

@@ -67,11 +67,13 @@ pub enum Corruption {
     OtherPlace,
     /// One image shows some other place.
     OtherPlaceSide,
+    /// Both images are exposed for so long that most of them is white.
+    OverExposed,
 }
 
 impl Corruption {
     /// Every one.
-    pub const ALL: [Self; 27] = [
+    pub const ALL: [Self; 28] = [
         Self::None,
         Self::Blur,
         Self::Black,
@@ -99,6 +101,7 @@ impl Corruption {
         Self::Displaced,
         Self::OtherPlace,
         Self::OtherPlaceSide,
+        Self::OverExposed,
     ];
 }
 
@@ -275,6 +278,10 @@ impl<'a> Spoiler<'a> {
                 take_side(&mut pair, self.material.other_place, self.side);
                 self.renew(&mut pair);
             }
+            Corruption::OverExposed => {
+                let gain = 4.0 + 4.0 * self.strength;
+                self.on_both(&mut pair, |_, image| multiply(image, gain));
+            }
         }
         Spoilt { pair, truth }
     }
@@ -372,9 +379,7 @@ impl<'a> Spoiler<'a> {
         } else {
             1.5 + 2.0 * self.strength
         };
-        for value in image.pixels_mut() {
-            *value = grey(gain * f64::from(*value));
-        }
+        multiply(image, gain);
     }
 
     /// A round blot in which the image is out of focus and pale.
@@ -428,6 +433,12 @@ fn take_side(pair: &mut StereoPair, other: &StereoPair, side: Side) {
     match side {
         Side::Left => pair.left.clone_from(&other.left),
         Side::Right => pair.right.clone_from(&other.right),
+    }
+}
+
+fn multiply(image: &mut GrayImage, gain: f64) {
+    for value in image.pixels_mut() {
+        *value = grey(gain * f64::from(*value));
     }
 }
 

@@ -128,8 +128,8 @@ fn mistakes_are_told_in_a_sentence() {
     }
 }
 
-/// The short form of `cargo bench --bench corrupted`. What two images cannot be told from one honest pair by is left
-/// out: there the bench counts.
+/// The short form of `cargo bench --bench corrupted`. Images whose larger part is late, and never handed on twice, look
+/// like those of a robot that brakes: there the bench counts.
 #[test]
 fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
     use visod::geometry::RigUncertainty;
@@ -147,23 +147,14 @@ fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
     println!("{}", outcome.to_table());
     assert!(outcome.total().corrupted > 200);
     for (kind, tally) in &outcome.kinds {
-        assert_eq!(tally.invalid, 0, "{kind:?}");
-        let must_hold = matches!(
-            kind,
-            Corruption::None
-                | Corruption::Black
-                | Corruption::BlackSide
-                | Corruption::Saturated
-                | Corruption::Swapped
-                | Corruption::Frozen
-                | Corruption::FrozenSide
-                | Corruption::LateSide
-                | Corruption::OtherPlace
-                | Corruption::OtherPlaceSide
-        );
-        if must_hold {
-            assert_eq!(tally.wrong_motions + tally.wrong_poses, 0, "{kind:?}");
-            assert!(tally.tracking > 10, "{kind:?} {}", tally.tracking);
+        assert_eq!(tally.invalid, 0, "{kind}");
+        assert!(tally.tracking > 10, "{kind} {}", tally.tracking);
+        if *kind != Corruption::HalfLate {
+            assert_eq!(tally.wrong_poses, 0, "{kind}");
+        }
+        // A motion to or from images that are smeared is as little as 5.2 σ wrong now and then.
+        if ![Corruption::HalfLate, Corruption::Blur].contains(kind) {
+            assert_eq!(tally.wrong_motions, 0, "{kind}");
         }
     }
 }

