@@ -77,6 +77,14 @@ pub(crate) fn one_line(text: &str, longest: usize) -> String {
     line
 }
 
+/// What is wrong with a folder that holds an image of this name; `None` where the name may stand in messages.
+pub(crate) fn doubt_of_image_name(name: &str) -> Option<String> {
+    (!is_one_line(name)).then(|| {
+        let name = shown(name);
+        format!("holds an image whose name has a control character: \"{name}\"")
+    })
+}
+
 /// Whether a name may stand in a message as it is.
 pub(crate) fn is_one_line(name: &str) -> bool {
     !name.contains(char::is_control)

@@ -101,11 +101,8 @@ fn images(folder: &Path) -> Result<Vec<(String, PathBuf)>, String> {
             continue;
         };
         if ENDINGS.contains(&ending.as_str()) && !name.starts_with('.') {
-            if !text_file::is_one_line(name) {
-                let name = text_file::shown(name);
-                return Err(fail(&format_args!(
-                    "the name of an image has a control character: \"{name}\""
-                )));
+            if let Some(why) = text_file::doubt_of_image_name(name) {
+                return Err(format!("{}: {why}", folder.display()));
             }
             images.push((name.to_owned(), file.clone()));
         }

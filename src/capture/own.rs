@@ -155,9 +155,7 @@ pub(super) fn images_in(folder: &Path) -> Result<BTreeMap<Stem, PathBuf>, Datase
         let Some(stem) = Stem::of(&file) else {
             continue;
         };
-        if !text::is_one_line(&stem.name.to_string_lossy()) {
-            let name = text::shown(&stem.name.to_string_lossy());
-            let why = format!("holds an image whose name has a control character: \"{name}\"");
+        if let Some(why) = text::doubt_of_image_name(&stem.name.to_string_lossy()) {
             return Err(DatasetError::file(folder, why));
         }
         if let Some(other) = images.insert(stem, file.clone()) {

@@ -3,7 +3,7 @@
 use super::MAX_STAMP_NS;
 use super::dataset::DatasetError;
 use crate::text_file;
-pub(super) use crate::text_file::{is_one_line, shown};
+pub(super) use crate::text_file::{doubt_of_image_name, is_one_line, shown};
 use std::path::Path;
 
 /// Longest text file that is read, bytes: stamps of millions of frames.

@@ -205,8 +205,8 @@ impl Method {
     /// Takes the next pair and says where the camera is.
     ///
     /// # Errors
-    /// An image, or a good part of it, is one that the camera has shown before, or its features could not be matched. The method stands
-    /// as before the pair, which is then to be [skipped](Self::skip).
+    /// An image, or a good part of it, is one that the camera has shown before, or its features could not be
+    /// matched. The method stands as before the pair, which is then to be [skipped](Self::skip).
     pub fn step(&mut self, pair: &mut DescribedPair) -> Result<Odometry, StepError> {
         self.has_stepped = false;
         self.repeats.check(pair)?;

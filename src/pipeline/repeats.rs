@@ -27,21 +27,24 @@ pub(super) struct Repeats {
 /// A camera hands on what it has handed on before.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
 #[error("{} there before, to the byte: a camera or its driver hands on what is old", self.words())]
-pub struct Repeated {
-    /// How many bands are old, of each camera's image.
-    old: [usize; 2],
-    /// Whether nothing else is in it.
-    whole: [bool; 2],
+pub struct Repeated([Old; 2]);
+
+/// How much of an image is old.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Old {
+    Nothing,
+    Part,
+    Whole,
 }
 
 impl Repeated {
     fn words(&self) -> &'static str {
-        match (self.old, self.whole) {
-            ([_, 0], [true, _]) => "the left image was",
-            ([_, 0], _) => "a part of the left image was",
-            ([0, _], [_, true]) => "the right image was",
-            ([0, _], _) => "a part of the right image was",
-            (_, [true, true]) => "each image was",
+        match self.0 {
+            [Old::Whole, Old::Nothing] => "the left image was",
+            [Old::Part, Old::Nothing] => "a part of the left image was",
+            [Old::Nothing, Old::Whole] => "the right image was",
+            [Old::Nothing, Old::Part] => "a part of the right image was",
+            [Old::Whole, Old::Whole] => "each image was",
             _ => "a part of each image was",
         }
     }
@@ -63,22 +66,31 @@ impl Repeats {
             return Ok(());
         }
         let now = [&pair.left.fingerprints, &pair.right.fingerprints];
-        let told = now.map(|now| now.iter().flatten().count());
         let old = [0, 1].map(|side| {
             let last = self.last[side][..self.remembered].iter();
-            let old = last.map(|last| in_common(now[side], last)).max();
-            old.filter(|old| *old >= told[side].clamp(1, OLD_BANDS))
-                .unwrap_or(0)
+            how_old(now[side], last)
         });
         for (last, now) in self.last.iter_mut().zip(now) {
             last[self.next] = *now;
         }
         self.next = (self.next + 1) % self.remembered;
-        if old == [0, 0] {
+        if old == [Old::Nothing; 2] {
             return Ok(());
         }
-        let whole = [old[0] == told[0], old[1] == told[1]];
-        Err(Repeated { old, whole })
+        Err(Repeated(old))
+    }
+}
+
+/// How much of an image is that of one of the `last`.
+fn how_old<'a>(now: &Prints, last: impl Iterator<Item = &'a Prints>) -> Old {
+    let told = now.iter().flatten().count();
+    let old = last.map(|last| in_common(now, last)).max().unwrap_or(0);
+    if old < told.clamp(1, OLD_BANDS) {
+        Old::Nothing
+    } else if old < told {
+        Old::Part
+    } else {
+        Old::Whole
     }
 }
 

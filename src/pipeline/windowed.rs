@@ -320,7 +320,7 @@ impl Windowed {
 
     /// Whether the motion that `agreed` is for is the robot's, as far as the landmarks tell.
     fn is_convincing(&mut self, predicted: &Isometry3<f64>, seed: u64) -> bool {
-        let share = self.share_of_agreed();
+        let share = share_of(&self.agreed, &self.weights);
         share >= LEAST_AGREEMENT
             && (share >= CLEAR_AGREEMENT || !self.do_others_agree(predicted, seed))
     }
@@ -355,11 +355,6 @@ impl Windowed {
             let in_its_part = self.occupancy.count(&seen.measurement.left_px()).max(1);
             f64::from((1 + portrait.age).min(SENIORITY)) / f64::from(in_its_part)
         }));
-    }
-
-    /// The share of the votes that are for the motion.
-    fn share_of_agreed(&self) -> f64 {
-        share_of(&self.agreed, &self.weights)
     }
 
     /// Has the watch on the rig look at the landmarks that agree with a motion. Where none was found, the right
@@ -479,14 +474,14 @@ impl Windowed {
     /// the world or outshines it, they are not.
     fn are_seniors_there(&self, bench: &Workbench) -> bool {
         let expected = self.gallery.portraits.iter().zip(&bench.predicted);
-        let (mut found, mut all) = (0.0, 0.0);
+        let (mut found, mut all) = (0_u32, 0_u32);
         for (portrait, px) in expected {
             if portrait.age >= SENIORITY && px.is_some_and(|px| is_inside(&bench.rig, &px)) {
-                all += 1.0;
-                found += f64::from(u8::from(portrait.found));
+                all += 1;
+                found += u32::from(portrait.found);
             }
         }
-        found >= QUORUM * all
+        f64::from(found) >= QUORUM * f64::from(all)
     }
 
     /// Where a landmark's patch is in the present pair, near `start`.
