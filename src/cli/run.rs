@@ -96,7 +96,7 @@ pub(crate) fn run(args: &Args) -> Result<(), Failure> {
     let finished = session.run(source);
     // The last thing that systemd is told; a panic in it has been reported already.
     let _ = attending.join();
-    if let Some(Err(e)) = keeper.as_ref().map(Keeper::write) {
+    if let Some(Err(e)) = keeper.as_ref().map(Keeper::close) {
         tracing::warn!("{e}");
     }
     let finished = finished?;

@@ -1,8 +1,9 @@
 //! Rows in; a small file that outlives the process out, and in the next run what it says.
 //!
 //! The file holds the number of the run's last epoch, so that epochs rise from run to run, and the last pose
-//! that was known with its covariance. Writing it is somebody's work beside the pipeline, which only leaves a
-//! copy of its latest pose here; it is written to a file beside it first and then renamed, so that a loss of
+//! that was known with its covariance. While the run lasts, the number is some epochs ahead: a run that is killed
+//! may have begun epochs that the file never heard of. Writing it is somebody's work beside the pipeline, which only
+//! leaves a copy of its latest pose here; it is written to a file beside it first and then renamed, so that a loss of
 //! power leaves either the old one or the new one.
 
 use crate::estimation::{Odometry, Start, Status};
@@ -263,8 +264,14 @@ struct Inner {
 struct State {
     kept: Kept,
     changed: bool,
+    /// Whether an epoch has begun that the file does not know of.
+    has_new_epoch: bool,
     written: Instant,
 }
+
+/// So many epochs the file is ahead of a run that goes on. More cannot begin between two looks at whether it has to
+/// be written: each takes some pairs.
+const EPOCHS_AHEAD: u32 = 4;
 
 impl Keeper {
     /// Keeps what a run comes to, if the settings want it. The file is written at once, for a run that ends
@@ -287,18 +294,22 @@ impl Keeper {
             state: Mutex::new(State {
                 kept,
                 changed: true,
+                has_new_epoch: true,
                 written: Instant::now(),
             }),
         }));
-        keeper.write()?;
+        keeper.write(EPOCHS_AHEAD)?;
         Ok(Some(keeper))
     }
 
     /// Takes note of a row whose pair was taken at `realtime_ns`. Costs a copy.
     pub fn note(&self, odometry: &Odometry, realtime_ns: i64) {
         let mut state = self.state();
-        state.changed |= state.kept.epoch != odometry.epoch;
-        state.kept.epoch = odometry.epoch;
+        if state.kept.epoch != odometry.epoch {
+            state.kept.epoch = odometry.epoch;
+            state.has_new_epoch = true;
+            state.changed = true;
+        }
         // A row that only begins knows nothing that the file did not know better.
         if odometry.status != Status::Initializing {
             state.kept.pose = Some(KnownPose::of(odometry, realtime_ns));
@@ -306,32 +317,41 @@ impl Keeper {
         }
     }
 
-    /// Writes the file if it is due.
+    /// Writes the file if it is due: from time to time, and soon after an epoch has begun.
     ///
     /// # Errors
     /// The file cannot be written; the message names it.
     pub fn write_if_due(&self) -> io::Result<()> {
-        if self.state().written.elapsed() < self.0.every {
-            return Ok(());
+        let is_due = {
+            let state = self.state();
+            state.changed && (state.has_new_epoch || state.written.elapsed() >= self.0.every)
+        };
+        if is_due {
+            self.write(EPOCHS_AHEAD)?;
         }
-        self.write()
+        Ok(())
     }
 
-    /// Writes the file if there is anything new.
+    /// Writes the file for the last time: the run begins no epoch any more.
     ///
     /// # Errors
     /// The file cannot be written; the message names it.
-    pub fn write(&self) -> io::Result<()> {
-        let kept = {
+    pub fn close(&self) -> io::Result<()> {
+        self.write(0)
+    }
+
+    fn write(&self, epochs_ahead: u32) -> io::Result<()> {
+        let mut kept = {
             let mut state = self.state();
             state.written = Instant::now();
-            if !std::mem::replace(&mut state.changed, false) {
-                return Ok(());
-            }
+            state.changed = false;
+            state.has_new_epoch = false;
             state.kept
         };
+        kept.epoch = kept.epoch.saturating_add(epochs_ahead);
         let file = &self.0.file;
         save(file, &kept).map_err(|e| {
+            self.state().changed = true;
             io::Error::other(format!(
                 "{}: the last pose cannot be kept: {e}",
                 file.display()
@@ -405,7 +425,7 @@ mod tests {
         for row in rows {
             keeper.note(row, NOW_NS);
         }
-        keeper.write().expect("writable");
+        keeper.close().expect("writable");
     }
 
     #[test]
@@ -439,6 +459,44 @@ mod tests {
         let next = Legacy::read(&settings, NOW_NS + 2 * SECOND_NS);
         assert_eq!(next.epoch, 2);
         assert_eq!(next.start.expect("restored").gap, Duration::from_secs(2));
+    }
+
+    #[test]
+    fn epochs_rise_past_those_that_a_killed_run_had_no_time_to_write_down() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let settings = settings(&folder);
+        let mut highest = None;
+        for epochs in [1, 2, 3, 1] {
+            let legacy = Legacy::read(&settings, NOW_NS);
+            assert!(highest.is_none_or(|highest| legacy.epoch > highest));
+            let keeper = Keeper::start(&settings, &legacy)
+                .expect("writable")
+                .expect("wanted");
+            for began in 0..epochs {
+                keeper.note(&row(Status::Initializing, legacy.epoch + began), NOW_NS);
+            }
+            // Killed: nobody writes.
+            highest = Some(legacy.epoch + epochs - 1);
+        }
+    }
+
+    #[test]
+    fn a_new_epoch_is_written_at_once_and_a_pose_when_it_is_time() {
+        let folder = tempfile::tempdir().expect("a folder");
+        let settings = settings(&folder);
+        let keeper = Keeper::start(&settings, &Legacy::default())
+            .expect("writable")
+            .expect("wanted");
+        let written = || load(settings.file.as_deref().expect("set")).expect("readable");
+        keeper.note(&row(Status::Tracking, 0), NOW_NS);
+        keeper.write_if_due().expect("writable");
+        assert!(written().pose.is_none());
+        keeper.note(&row(Status::Initializing, 1), NOW_NS);
+        keeper.write_if_due().expect("writable");
+        assert_eq!(written().epoch, 1 + EPOCHS_AHEAD);
+        assert!(written().pose.is_some());
+        keeper.close().expect("writable");
+        assert_eq!(written().epoch, 1);
     }
 
     #[test]
