@@ -170,12 +170,6 @@ impl Odometer {
         )
     }
 
-    /// Whether the motion up to the last row was not measured.
-    #[must_use]
-    pub fn is_bridging(&self) -> bool {
-        self.bridged > 0
-    }
-
     /// Whether any motion has been measured since the odometry frame began.
     #[must_use]
     pub fn has_tracked(&self) -> bool {
@@ -361,7 +355,9 @@ impl Odometer {
             let change = Vector6::new(a, a, a, alpha, alpha, alpha);
             self.velocity.cov * (t * t) + Matrix6::from_diagonal(&change.component_mul(&change))
         };
-        let growth = total(timestamp_ns) - total(self.last.timestamp_ns);
+        // A stamp that goes backwards takes nothing back of what is unknown.
+        let last_ns = self.last.timestamp_ns;
+        let growth = total(timestamp_ns.max(last_ns)) - total(last_ns);
         se3::symmetric(&growth) + Matrix6::identity() * ORIGIN_VARIANCE
     }
 
@@ -480,4 +476,62 @@ fn velocity_of(motion: &MotionEstimate, dt_s: f64, sigma_stamp_s: f64) -> Veloci
 /// Time from one stamp to a later one, s; 0 where the clock went backwards.
 fn seconds_between(from_ns: i64, to_ns: i64) -> f64 {
     (to_ns.saturating_sub(from_ns).max(0)) as f64 / NS_PER_S
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::geometry::StereoRig;
+    use crate::simulation;
+    use proptest::prelude::*;
+
+    fn odometer() -> Odometer {
+        let rig: StereoRig = simulation::thesis_rig();
+        let settings = Settings::default();
+        let errors = RigErrors::of(&rig, &settings);
+        Odometer::new(settings, errors, stamp(0))
+    }
+
+    fn stamp(timestamp_ms: i64) -> PairStamp {
+        PairStamp {
+            sequence: 0,
+            timestamp_ns: timestamp_ms * 1_000_000,
+        }
+    }
+
+    fn measured() -> MeasuredMotion {
+        MeasuredMotion {
+            estimate: MotionEstimate {
+                prev_from_now: se3::exp(&Vector6::new(0.0, 0.0, 0.1, 0.0, 0.01, 0.0)),
+                cov_right: Matrix6::identity() * 1e-6,
+            },
+            by_sources: BySources::zeros(),
+            variance_factor: 1.0,
+            inliers: 100,
+            departure: None,
+        }
+    }
+
+    proptest! {
+        /// Whether stamps rise, stand still or fall, pairs are measured or bridged.
+        #[test]
+        fn covariances_are_covariances_whatever_the_stamps(
+            rows in proptest::collection::vec((-300_i64..900, any::<bool>()), 1..20),
+        ) {
+            let mut odometer = odometer();
+            odometer.begin(stamp(0), Counts::default());
+            let mut cov_chained = Matrix6::identity() * ORIGIN_VARIANCE;
+            for (timestamp_ms, is_measured) in rows {
+                let row = if is_measured {
+                    cov_chained += Matrix6::identity() * 1e-6;
+                    odometer.advance(stamp(timestamp_ms), &measured(), &cov_chained, Counts::default())
+                } else {
+                    odometer.bridge(stamp(timestamp_ms), Counts::default())
+                };
+                for cov in [row.cov_pose, row.cov_motion, row.cov_twist] {
+                    prop_assert!(cov.cholesky().is_some(), "{row:?}");
+                }
+            }
+        }
+    }
 }
