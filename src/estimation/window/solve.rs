@@ -115,6 +115,7 @@ impl Window {
         sightings.indices.clear();
         sightings.prepared.clear();
         let scale = 1.0 / self.variance.smoothed;
+        let cov_warp = self.cov_warp * scale;
         for ((i, s), &weight) in (0..).zip(seen).zip(weights) {
             let moved = self.landmark(s.id).and_then(|landmark| {
                 let newest_from_anchor = self.newest_from_anchor(landmark)?;
@@ -126,6 +127,7 @@ impl Window {
                     inverse_depth,
                     cov: cov * scale,
                     now: self.warp.corrected(&s.measurement),
+                    displacement_px2: self.warp.displacement_px2(&s.measurement, &cov_warp),
                     weight,
                 });
             }

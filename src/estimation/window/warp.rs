@@ -10,8 +10,9 @@
 use super::super::calibration::sight_by_rig;
 use super::super::{Settings, StereoMeasurement, seen_at};
 use crate::geometry::StereoRig;
+use crate::geometry::product::{product, product_transposed};
 use crate::geometry::rig_parameters::RIG_PARAMETERS;
-use nalgebra::{DVector, Isometry3, SMatrix, SVector, Vector2, Vector4};
+use nalgebra::{DVector, Isometry3, Matrix2, SMatrix, SVector, Vector2, Vector4};
 
 /// Terms across the baseline: 1, x, y, x², xy, y².
 const TERMS: usize = 6;
@@ -62,6 +63,16 @@ impl Warp {
             .fixed_columns_mut::<TERMS>(1)
             .copy_from(&(self.across * terms));
         by_warp
+    }
+
+    /// Covariance, px², of the displacement there, for one of the unknowns.
+    pub(super) fn displacement_px2(
+        &self,
+        measurement: &StereoMeasurement,
+        cov_warp: &WarpCovariance,
+    ) -> Matrix2<f64> {
+        let by_warp = self.derivative(measurement);
+        product_transposed(&product(&by_warp, cov_warp), &by_warp)
     }
 
     /// The measurement that a rig as calibrated would have made.
