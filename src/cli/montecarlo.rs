@@ -57,6 +57,9 @@ pub(crate) struct Args {
         default_value = "2,40"
     )]
     depth: Vec<f64>,
+    /// Keyframes in the window, where the method is one.
+    #[arg(long, value_name = "N", default_value_t = Settings::default().keyframes)]
+    keyframes: u32,
     /// Chance that a feature of one motion serves the next one too.
     #[arg(long, value_name = "SHARE", default_value_t = Settings::default().survival)]
     survival: f64,
@@ -253,6 +256,7 @@ impl Args {
             model: self.model,
             estimator: self.method.of_motions(),
             windowed: self.method == Method::Window,
+            keyframes: self.keyframes,
             features: self.features,
             depth_m: [near, far],
             survival: self.survival,

@@ -28,7 +28,7 @@ pub mod window;
 pub use model::{FLAT_LIMIT, Model, MotionModel, Plane};
 pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
 pub use odometer::{Odometer, PairStamp, Place};
-pub use settings::{Method, Settings};
+pub use settings::{KEYFRAMES, Method, Settings};
 pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
 pub use start::Start;
 pub use tracked_feature::TrackedFeature;

@@ -4,6 +4,7 @@ use super::MotionModel;
 use super::two_frame::Estimator;
 use crate::settings::SettingError;
 use serde::{Deserialize, Serialize};
+use std::ops::RangeInclusive;
 
 /// Which estimator.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
@@ -65,7 +66,8 @@ pub struct Settings {
     pub gate_sigma2: f64,
     /// Seed of consensus. Any, default 1: the same seed gives the same bits.
     pub seed: u64,
-    /// Keyframes in the window. 2 to 12, default 7: more costs time and gains little.
+    /// Keyframes in the window. 2 to 12, default 7: more costs time, and gains where landmarks are seen in many of
+    /// them.
     pub keyframes: u32,
     /// Landmarks that are tracked at once. 20 to 5000, default 300: more cost time and gain little.
     pub max_landmarks: u32,
@@ -138,6 +140,9 @@ impl Default for Settings {
     }
 }
 
+/// Keyframes that a window can have.
+pub const KEYFRAMES: RangeInclusive<u32> = 2..=12;
+
 impl Settings {
     /// Refuses values out of range.
     ///
@@ -148,7 +153,7 @@ impl Settings {
         SettingError::unless_in("good_inliers", self.good_inliers, 3..=10_000)?;
         SettingError::unless_in("max_samples", self.max_samples, 10..=100_000)?;
         SettingError::unless_in("gate_sigma2", self.gate_sigma2, 1.0..=100.0)?;
-        SettingError::unless_in("keyframes", self.keyframes, 2..=12)?;
+        SettingError::unless_in("keyframes", self.keyframes, KEYFRAMES)?;
         SettingError::unless_in("max_landmarks", self.max_landmarks, 20..=5000)?;
         SettingError::unless_in("keyframe_survival", self.keyframe_survival, 0.0..=1.0)?;
         SettingError::unless_in("keyframe_parallax", self.keyframe_parallax, 0.0..=1.0)?;

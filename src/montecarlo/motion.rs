@@ -95,6 +95,7 @@ impl Settings {
             calibration_sigma_px: 0.0,
             consider_calibration: self.rig_error == RigError::Considered,
             gate_sigma2: self.gate_sigma2,
+            keyframes: self.keyframes,
             ..estimation::Settings::default()
         }
     }
@@ -113,6 +114,7 @@ impl Settings {
             calibration_sigma_px: 0.0,
             consider_calibration: self.rig_error == RigError::Considered,
             gate_sigma2: self.gate_sigma2,
+            keyframes: self.keyframes,
             ..estimation::Settings::default()
         }
     }

@@ -1,7 +1,7 @@
 //! What is simulated.
 
-use crate::estimation::MotionModel;
 use crate::estimation::two_frame::Estimator;
+use crate::estimation::{self, MotionModel};
 use crate::settings::SettingError;
 use crate::simulation::points::PixelNoise;
 
@@ -43,6 +43,8 @@ pub struct Settings {
     /// Whether a path is estimated by the window of keyframes, as the pipeline does, instead of by
     /// chained motions. Default: it is not.
     pub windowed: bool,
+    /// Keyframes in the window, where there is one. Number, 2 to 12, default that of the estimation.
+    pub keyframes: u32,
     /// Features that a motion rests on. Number, 3 to 10000, default 100.
     pub features: usize,
     /// Depth at which landmarks appear, from the left camera, uniform in between. m, 0.1 to 10000,
@@ -88,6 +90,7 @@ impl Default for Settings {
             model: MotionModel::Se3,
             estimator: Estimator::Bundle,
             windowed: false,
+            keyframes: estimation::Settings::default().keyframes,
             features: 100,
             depth_m: [2.0, 40.0],
             survival: 0.9,
@@ -112,6 +115,7 @@ impl Settings {
     /// The first setting out of range.
     pub fn check(&self) -> Result<(), SettingError> {
         SettingError::unless_in("runs", self.runs, 10..=1_000_000)?;
+        SettingError::unless_in("keyframes", self.keyframes, estimation::KEYFRAMES)?;
         SettingError::unless_in("features", self.features, 3..=10_000)?;
         let [near, far] = self.depth_m;
         SettingError::unless_in("depth", near, 0.1..=1e4)?;
