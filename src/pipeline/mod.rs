@@ -12,6 +12,7 @@ mod repeats;
 mod statistics;
 mod trim;
 mod two_frame;
+mod unlikeness;
 mod windowed;
 
 pub use driver::{Delivery, Fault, PipelineError, Settings, Stage, StageLatencies, run};

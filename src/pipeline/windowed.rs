@@ -5,6 +5,7 @@
 use super::gallery::{Gallery, Portrait};
 use super::method::Workbench;
 use super::occupancy::Occupancy;
+use super::unlikeness::Unlikeness;
 use crate::estimation::window::{self, Window};
 use crate::estimation::{
     self, Landmark, Odometer, Odometry, PairStamp, Settings, StereoMeasurement, TrackedFeature,
@@ -36,6 +37,10 @@ const LEAST_AGREEMENT: f64 = 0.5;
 const CLEAR_AGREEMENT: f64 = 0.8;
 /// The share of the others' votes that makes a second motion of them.
 const COHERENT: f64 = 0.6;
+/// The share below which a pair becomes no keyframe, where that can wait.
+const SETTLED_AGREEMENT: f64 = 0.65;
+/// Pairs for which a keyframe that is wanted waits for images that show one motion.
+const MOST_POSTPONED: u32 = 2;
 /// The share of the old landmarks that should be in view that has to be found.
 const QUORUM: f64 = 0.2;
 /// Sights that may prove wrong before a landmark is given up.
@@ -54,6 +59,9 @@ pub(super) struct Windowed {
     /// The same, what the right camera saw being unsure.
     unsure: Vec<window::Seen>,
     weights: Vec<f64>,
+    /// How well each of `seen` fits its landmark's patch.
+    correlations: Vec<f32>,
+    unlikeness: Unlikeness,
     /// Those of `seen` that do not agree with the motion, what their votes count, and those of them that agree with
     /// each other.
     others: Vec<window::Seen>,
@@ -63,9 +71,15 @@ pub(super) struct Windowed {
     agreed: Vec<u32>,
     /// The tracks that `seen` comes from.
     matches: Vec<usize>,
-    /// Whether landmarks were found where the pair before led to expect them. Far around, or after a bridge, much is
-    /// found that does not belong together.
+    /// Whether landmarks were found where the pairs before led to expect them. Far around, much is found that does not
+    /// belong together.
     are_where_expected: bool,
+    /// Whether most landmarks agree on the present motion.
+    is_settled: bool,
+    /// Pairs in a row that were no keyframe although one was wanted.
+    postponed: u32,
+    /// Pairs that were tracked since the window began.
+    tracked_pairs: u32,
     /// Whether a stereo match of the present pair shows a landmark that is known.
     is_known: Vec<bool>,
     occupancy: Occupancy,
@@ -88,12 +102,17 @@ impl Windowed {
             seen: Vec::new(),
             unsure: Vec::new(),
             weights: Vec::new(),
+            correlations: Vec::new(),
+            unlikeness: Unlikeness::default(),
             others: Vec::new(),
             others_weights: Vec::new(),
             others_agreed: Vec::new(),
             agreed: Vec::new(),
             matches: Vec::new(),
             are_where_expected: false,
+            is_settled: false,
+            postponed: 0,
+            tracked_pairs: 0,
             is_known: Vec::new(),
             occupancy: Occupancy::default(),
             candidates: Vec::new(),
@@ -158,6 +177,10 @@ impl Windowed {
                 return None;
             }
             self.gallery.grow_older();
+            let widened = self.unlikeness.widening();
+            for s in &mut self.seen {
+                s.measurement.sigma_px *= widened;
+            }
             self.window.add(&newest_from_now, &self.seen);
             self.window.expose(&bench.exposure);
             self.window.adjust()
@@ -166,12 +189,13 @@ impl Windowed {
             return self.bridge(bench, odometer, stamp);
         };
         self.holds_present = true;
+        self.tracked_pairs += 1;
         self.take_looks(bench);
         self.window.settle();
         let mut counts = bench.counts(tracked.inliers);
         counts.tracks = self.seen.len() as u32;
         let row = odometer.arrive(stamp, &tracked, counts);
-        if self.wants_keyframe(bench) {
+        if self.wants_keyframe(bench) && self.may_promote() {
             self.promote(bench);
         }
         row
@@ -184,6 +208,7 @@ impl Windowed {
             .begin_at(&place.odom_from_camera, &place.cov, &place.by_sources);
         self.window.expose(&bench.exposure);
         self.gallery.clear();
+        self.tracked_pairs = 0;
         let images = self.images.drain(..).map(|(_, image)| image);
         self.spare_images.extend(images);
         self.is_known.clear();
@@ -232,7 +257,7 @@ impl Windowed {
         if odometer.has_velocity() {
             self.find_tracks(bench, bench.matching.search_radius_px)?;
             if bench.tracks.len() >= bench.estimation.good_inliers as usize {
-                self.are_where_expected = !odometer.is_bridging();
+                self.are_where_expected = true;
                 return Ok(());
             }
         }
@@ -276,6 +301,7 @@ impl Windowed {
     ) -> Option<Isometry3<f64>> {
         self.seen.clear();
         self.matches.clear();
+        self.correlations.clear();
         self.occupancy.begin(&bench.rig.left);
         let now_from_newest = predicted.inverse();
         for i in 0..bench.tracks.len() {
@@ -294,6 +320,7 @@ impl Windowed {
             self.gallery.portraits[gallery_index].slant = found.slant;
             self.occupancy.enter(&found.measurement.left_px());
             self.matches.push(i);
+            self.correlations.push(found.correlation);
             self.seen.push(window::Seen {
                 id: self.gallery.portraits[gallery_index].id,
                 measurement: found.measurement,
@@ -311,18 +338,30 @@ impl Windowed {
                     .consent(&self.seen, &self.weights, predicted, seed, &mut self.agreed);
         }
         let newest_from_now = newest_from_now?;
-        if self.are_where_expected && !self.is_convincing(predicted, seed) {
+        if !self.is_convincing(predicted, seed) {
             return None;
         }
+        let of_agreed = self.agreed.iter().map(|&i| self.correlations[i as usize]);
+        self.unlikeness.take(of_agreed);
         self.take_note(bench);
         Some(newest_from_now)
     }
 
     /// Whether the motion that `agreed` is for is the robot's, as far as the landmarks tell.
     fn is_convincing(&mut self, predicted: &Isometry3<f64>, seed: u64) -> bool {
+        // In a window that is young nothing has stood still for long enough to say which of two it is.
+        self.is_settled = self.tracked_pairs < SENIORITY;
+        if self.is_settled {
+            return true;
+        }
         let share = share_of(&self.agreed, &self.weights);
-        share >= LEAST_AGREEMENT
-            && (share >= CLEAR_AGREEMENT || !self.do_others_agree(predicted, seed))
+        self.is_settled = share >= SETTLED_AGREEMENT;
+        let least = if self.are_where_expected {
+            LEAST_AGREEMENT
+        } else {
+            0.0
+        };
+        share >= least && (share >= CLEAR_AGREEMENT || !self.do_others_agree(predicted, seed))
     }
 
     /// Whether those that do not agree agree with each other: the images then show two motions.
@@ -526,6 +565,14 @@ impl Windowed {
         self.window.survival() < settings.keyframe_survival
             || self.window.parallax_px()
                 > settings.keyframe_parallax * f64::from(bench.rig.left.width)
+    }
+
+    /// Whether the present pair may be kept where a keyframe is wanted: what is new in images that show something else as
+    /// well may belong to that, and would stay. Not for ever, or there would soon be nothing left to hold pairs against.
+    fn may_promote(&mut self) -> bool {
+        let may = self.is_settled || self.postponed >= MOST_POSTPONED;
+        self.postponed = if may { 0 } else { self.postponed + 1 };
+        may
     }
 
     /// Keeps the present pair as a keyframe, with what it shows for the first time.

@@ -78,6 +78,7 @@ pub fn refine(
     let mut appearance = *appearance;
     let (mut px, mut sigma_px) = (Vector4::zeros(), Vector4::zeros());
     let mut relief_px = Vector2::zeros();
+    let mut correlation = 1.0_f32;
     for (side, image) in [(0, images.left), (2, images.right)] {
         let view = View::new(&now, side, &by_px, &cameras[side / 2], inverse_depth);
         let from = Vector2::new(start[side], start[side + 1]);
@@ -88,11 +89,13 @@ pub fn refine(
             .fixed_rows_mut::<2>(side)
             .copy_from(&found.sigma_px);
         relief_px[side / 2] = found.relief_px;
+        correlation = correlation.min(found.correlation);
     }
     Some(Refined {
         measurement: StereoMeasurement { px, sigma_px },
         relief_px,
         slant: appearance.slant,
+        correlation,
     })
 }
 
@@ -122,6 +125,7 @@ pub fn refine_right(
         measurement,
         relief_px: Vector2::new(0.0, found.relief_px),
         slant: found.slant,
+        correlation: found.correlation,
     })
 }
 
@@ -136,6 +140,8 @@ pub struct Found {
     pub relief_px: f64,
     /// What is known of the surface with this image.
     pub slant: Slant,
+    /// Correlation with the patch in its anchor, −1 to 1.
+    pub correlation: f32,
 }
 
 /// A patch found in both images of a pair.
@@ -148,6 +154,8 @@ pub struct Refined {
     pub relief_px: Vector2<f64>,
     /// What is known of the surface with this pair.
     pub slant: Slant,
+    /// Correlation with the patch in its anchor, −1 to 1: the lesser one of both images.
+    pub correlation: f32,
 }
 
 /// Finds a patch in `image`, level by level.
@@ -186,6 +194,7 @@ pub fn coarse_to_fine(
                 sigma_px: var.map(f64::sqrt),
                 relief_px: RELIEF_PX * px * view.deformation(&slope),
                 slant: appearance.slant.after(slope, found.information),
+                correlation: found.correlation,
             };
             best = Some((found, var.sum()));
         }

@@ -43,7 +43,8 @@ pub enum Corruption {
     HalfOld,
     /// The lower part of one image is still that of the pair before.
     HalfOldSide,
-    /// The lower part of both images comes one pair late, and is not handed on twice.
+    /// The lower part of both images comes one pair late, and is not handed on twice. The truth is that of the larger
+    /// part.
     HalfLate,
     /// The lower part of both images is black.
     HalfBlack,
@@ -63,7 +64,7 @@ pub enum Corruption {
     Smear,
     /// One image is displaced by a few pixels, as by a wrong offset on the sensor.
     Displaced,
-    /// Both images show some other place.
+    /// Both images show some other place, where the cameras stand still.
     OtherPlace,
     /// One image shows some other place.
     OtherPlaceSide,
@@ -223,6 +224,7 @@ impl<'a> Spoiler<'a> {
                 let old = if self.kind == Corruption::HalfOld {
                     last_whole
                 } else {
+                    truth -= usize::from(self.cut < 0.5);
                     &pairs[index - 1]
                 };
                 self.lower_part(&mut pair.left, |row| old.left.row(row));
@@ -273,6 +275,7 @@ impl<'a> Spoiler<'a> {
             Corruption::OtherPlace => {
                 take_images(&mut pair, self.material.other_place);
                 self.renew(&mut pair);
+                truth = self.first;
             }
             Corruption::OtherPlaceSide => {
                 take_side(&mut pair, self.material.other_place, self.side);
