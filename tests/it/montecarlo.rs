@@ -147,7 +147,13 @@ fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
     assert!(outcome.total().corrupted > 200);
     for (kind, tally) in &outcome.kinds {
         assert_eq!(tally.invalid, 0, "{kind}");
-        assert!(tally.tracking > 5, "{kind} {}", tally.tracking);
+        // What has begun anew in another place has to begin anew in this one.
+        let least = if *kind == Corruption::OtherPlace {
+            5
+        } else {
+            10
+        };
+        assert!(tally.tracking > least, "{kind} {}", tally.tracking);
         assert_eq!(tally.wrong_poses, 0, "{kind}");
         // A motion to or from images that are smeared, or shown in two parts, is wrong now and then: there the bench
         // counts.
