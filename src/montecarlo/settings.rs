@@ -43,7 +43,7 @@ pub struct Settings {
     /// Whether a path is estimated by the window of keyframes, as the pipeline does, instead of by
     /// chained motions. Default: it is not.
     pub windowed: bool,
-    /// Keyframes in the window, where there is one. Number, 2 to 12, default that of the estimation.
+    /// Keyframes in the window, where there is one. Number, 2 to 20, default that of the estimation.
     pub keyframes: u32,
     /// Features that a motion rests on. Number, 3 to 10000, default 100.
     pub features: usize,

@@ -6,7 +6,7 @@
 
 mod common;
 
-use common::memory::Recording;
+use common::memory::{Recording, estimation};
 use common::ms;
 use visod::estimation::Settings;
 use visod::features::{self, Features};
@@ -24,14 +24,14 @@ fn main() {
     println!("| recording | stage | best ms | median ms | p99 ms | tracks | inliers |");
     println!("|---|---|---:|---:|---:|---:|---:|");
     let simulated = Recording::simulated(thesis_rig(), 12);
-    measure("simulated, 1280 × 960", &simulated, Settings::default());
+    measure("simulated, 1280 × 960", &simulated, estimation());
     let many = Settings {
         max_landmarks: MANY_LANDMARKS,
-        ..Settings::default()
+        ..estimation()
     };
     measure("the same, 500 tracks", &simulated, many);
     if let Some(kitti) = Recording::recorded("kitti_straight", 20) {
-        measure("KITTI", &kitti, Settings::default());
+        measure("KITTI", &kitti, estimation());
     }
 }
 

@@ -55,7 +55,7 @@ const fn row_of(i: usize) -> usize {
 }
 
 /// Frames in the window at most: keyframes, the last frame and the current one.
-const MAX_FRAMES: usize = 16;
+const MAX_FRAMES: usize = 24;
 /// Unknowns of the warp and of poses at most.
 const MAX_UNKNOWNS: usize = row_of(MAX_FRAMES);
 
