@@ -112,7 +112,7 @@ typedef struct visod_odometry_message {
     uint32_t stereo_matches;               /* 80: left–right matches */
     uint32_t tracks;                       /* 84: stereo matches found again from the pair before */
     uint32_t inliers;                      /* 88: tracks that the estimate rests on */
-    uint32_t reserved;                     /* 92: 0 */
+    uint32_t undetermined;                 /* 92: axes of the motion that the images leave open, as bits: 1, 2, 4 along x, y, z of the frame (σ above 0.1 m); 8, 16, 32 about them (above 0.01 rad); 63 where it was bridged */
     double variance_factor;                /* 96: a-posteriori variance factor; not a number where nothing was measured */
     double position_m[3];                  /* 104: of the frame in the odometry frame, m */
     double orientation_xyzw[4];            /* 128: of the frame in the odometry frame */

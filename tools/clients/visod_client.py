@@ -45,6 +45,7 @@ RIG_STATES = ("unwatched", "good", "moved", "misfits")
 BUDGET_PARTS = ("detection", "calibration", "synchronisation", "bridging")
 STAGES = ("capture", "features", "matching", "estimation", "total")
 
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
 _FLAG_REPLAY = 1
 _FLAG_BEYOND_FIRST_ORDER = 4
 
@@ -102,7 +103,7 @@ class OdometryMessage(ctypes.Structure):
         ("stereo_matches", ctypes.c_uint32),
         ("tracks", ctypes.c_uint32),
         ("inliers", ctypes.c_uint32),
-        ("reserved", ctypes.c_uint32),
+        ("undetermined", ctypes.c_uint32),
         ("variance_factor", ctypes.c_double),
         ("position_m", ctypes.c_double * 3),
         ("orientation_xyzw", ctypes.c_double * 4),
@@ -248,6 +249,7 @@ class Odometry:
     inliers: int
     variance_factor: float
     innovation_ratio: float
+    undetermined: tuple[str, ...]  # axes of the motion that the images leave open
     first_order: bool
     latencies_ns: dict[str, Optional[int]]
 
@@ -295,6 +297,7 @@ class Odometry:
             inliers=m.inliers,
             variance_factor=m.variance_factor,
             innovation_ratio=m.innovation_ratio,
+            undetermined=tuple(name for bit, name in enumerate(_AXES) if m.undetermined >> bit & 1),
             first_order=not m.flags & _FLAG_BEYOND_FIRST_ORDER,
             latencies_ns={
                 stage: getattr(m, f"latency_{stage}_ns") or None for stage in STAGES
