@@ -69,6 +69,7 @@ pub(super) fn picture(scene: &Scene<'_>, colours: bool) -> Vec<String> {
     lines.extend(budget(scene.message, &palette));
     lines.push(String::new());
     lines.push(features(&row));
+    lines.extend(undetermined(&row, &palette));
     lines.push(latency(scene));
     lines.extend(scene.health.map(|health| state(health, &palette)));
     lines
@@ -187,6 +188,13 @@ fn features(row: &OdometryRow) -> String {
         row.variance_factor,
         row.innovation_ratio,
     )
+}
+
+/// The axes that the images leave open, if there are any.
+fn undetermined(row: &OdometryRow, palette: &Palette) -> Option<String> {
+    let axes: Vec<&str> = row.undetermined.names().collect();
+    let said = || format!("  images do not tell {}", axes.join(", "));
+    (!axes.is_empty()).then(|| palette.bad.apply_to(said()).to_string())
 }
 
 fn latency(scene: &Scene<'_>) -> String {

@@ -4,6 +4,7 @@ pub mod bundle;
 pub mod calibration;
 pub mod closed_form;
 pub mod consensus;
+mod determinacy;
 pub mod influence;
 mod model;
 mod motion;
@@ -25,6 +26,7 @@ pub mod two_frame;
 pub mod weighted;
 pub mod window;
 
+pub use determinacy::Axes;
 pub use model::{FLAT_LIMIT, Model, MotionModel, Plane};
 pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
 pub use odometer::{Odometer, PairStamp, Place};
@@ -158,6 +160,15 @@ impl Odometry {
     #[must_use]
     pub fn is_first_order(&self) -> bool {
         is_first_order(&self.cov_pose)
+    }
+
+    /// The axes of the motion that the images leave open: all of them where it was bridged.
+    #[must_use]
+    pub fn undetermined(&self) -> Axes {
+        match self.status {
+            Status::Lost => Axes::ALL,
+            _ => Axes::left_open_by(&self.cov_motion),
+        }
     }
 }
 

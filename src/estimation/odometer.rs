@@ -10,7 +10,7 @@ use super::sources::{BySources, Exposure, RigErrors};
 use super::standing::Standing;
 use super::start::Start;
 use super::window::Tracked;
-use super::{Counts, ErrorBudget, FLAT_LIMIT, MeasuredMotion, Odometry, Settings, Status};
+use super::{Axes, Counts, ErrorBudget, FLAT_LIMIT, MeasuredMotion, Odometry, Settings, Status};
 use crate::geometry::se3;
 use crate::uncertainty::{compounding, consider};
 use nalgebra::{Isometry3, Matrix6, Vector6};
@@ -229,7 +229,8 @@ impl Odometer {
         self.last = now;
         self.reference_from_last = no_motion();
         let is_flat = measured.departure.is_none_or(|d| d <= FLAT_LIMIT);
-        let is_plausible = is_flat && is_possible;
+        let is_determined = Axes::left_open_by(&parts.total()).is_empty();
+        let is_plausible = is_flat && is_possible && is_determined;
         let status = self
             .standing
             .measured(measured.inliers, noise.innovation_ratio, is_plausible);
@@ -510,6 +511,26 @@ mod tests {
             inliers: 100,
             departure: None,
         }
+    }
+
+    #[test]
+    fn what_the_images_leave_open_degrades_the_pair_and_is_told() {
+        let mut odometer = odometer();
+        let cov_chained = Matrix6::identity() * 1e-6;
+        let row = odometer.begin(stamp(0), Counts::default());
+        assert_eq!(row.undetermined(), Axes::NONE);
+        let mut measured = measured();
+        let row = odometer.advance(stamp(100), &measured, &cov_chained, Counts::default());
+        assert_eq!(
+            (row.status, row.undetermined()),
+            (Status::Tracking, Axes::NONE)
+        );
+        measured.estimate.cov_right[(2, 2)] = 0.04;
+        let row = odometer.advance(stamp(200), &measured, &cov_chained, Counts::default());
+        let open: Vec<_> = row.undetermined().names().collect();
+        assert_eq!((row.status, open), (Status::Degraded, vec!["z"]));
+        let row = odometer.bridge(stamp(300), Counts::default());
+        assert_eq!((row.status, row.undetermined()), (Status::Lost, Axes::ALL));
     }
 
     proptest! {

@@ -45,7 +45,7 @@ impl Standing {
     }
 
     /// The status of a pair that was measured; `is_plausible` is false where the ground is taken as flat
-    /// and proves not to be, and where no robot moves like that.
+    /// and proves not to be, where no robot moves like that, and where the images leave an axis open.
     pub(super) fn measured(
         &mut self,
         inliers: u32,

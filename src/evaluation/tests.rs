@@ -8,7 +8,7 @@ use super::segments::segment_errors;
 use super::statistics::Statistics;
 use super::trajectory::{Form, parse_trajectory};
 use super::*;
-use crate::estimation::Counts;
+use crate::estimation::{Axes, Counts};
 use crate::geometry::{se3, so3};
 use crate::output::csv;
 use nalgebra::Vector3;
@@ -69,6 +69,7 @@ fn row(
         innovation_ratio: f64::NAN,
         budget_sigmas: [0.0; 24],
         is_first_order: true,
+        undetermined: Axes::NONE,
     }
 }
 

@@ -7,7 +7,7 @@
 use super::number::push_f64;
 use super::row::{OdometryRow, Value, from_upper_triangle, isometry};
 use crate::capture::MAX_STAMP_NS;
-use crate::estimation::{Counts, Odometry, Status};
+use crate::estimation::{Axes, Counts, Odometry, Status};
 use crate::text_file::shown;
 use std::fmt::Write as _;
 use std::fs::File;
@@ -19,7 +19,7 @@ const REQUIRED: usize = 66;
 
 /// The columns, in order; those from `epoch` on may be missing in a file.
 #[rustfmt::skip]
-pub const HEADER: [&str; 93] = [
+pub const HEADER: [&str; 94] = [
     "seq", "timestamp_ns", "status",
     "tx", "ty", "tz", "qx", "qy", "qz", "qw",
     "c00", "c01", "c02", "c03", "c04", "c05", "c11", "c12", "c13", "c14", "c15",
@@ -38,7 +38,7 @@ pub const HEADER: [&str; 93] = [
     "sigma_synchronisation_rx", "sigma_synchronisation_ry", "sigma_synchronisation_rz",
     "sigma_bridging_x", "sigma_bridging_y", "sigma_bridging_z",
     "sigma_bridging_rx", "sigma_bridging_ry", "sigma_bridging_rz",
-    "first_order",
+    "first_order", "undetermined",
 ];
 
 /// The header line, without its end.
@@ -287,6 +287,18 @@ impl Record<'_> {
                 Some(_) => self.parse::<u8>(92, "0 or 1")? != 0,
                 None => true,
             },
+            undetermined: self.undetermined(93)?,
+        })
+    }
+
+    fn undetermined(&self, column: usize) -> Result<Axes, CsvError> {
+        if self.columns[column].is_none() {
+            return Ok(Axes::NONE);
+        }
+        let what = "a whole number from 0 to 63";
+        Axes::from_bits(self.parse(column, what)?).ok_or_else(|| {
+            let text = shown(self.text(column));
+            self.wrong(Some(column), format!("must be {what}, but is '{text}'"))
         })
     }
 
@@ -427,7 +439,7 @@ mod tests {
             sigma_calibration_x,sigma_calibration_y,sigma_calibration_z,sigma_calibration_rx,sigma_calibration_ry,sigma_calibration_rz,\
             sigma_synchronisation_x,sigma_synchronisation_y,sigma_synchronisation_z,sigma_synchronisation_rx,sigma_synchronisation_ry,sigma_synchronisation_rz,\
             sigma_bridging_x,sigma_bridging_y,sigma_bridging_z,sigma_bridging_rx,sigma_bridging_ry,sigma_bridging_rz,\
-            first_order";
+            first_order,undetermined";
         assert_eq!(header_line(), expected);
         let mut names = Vec::new();
         OdometryRow::new(&sample_odometry(0), None).for_each(|name, _| names.push(name.to_owned()));
@@ -475,7 +487,7 @@ mod tests {
         );
         assert_eq!(
             message(text.trim_end().rsplit_once(',').unwrap().0),
-            "o.csv:4: has 92 fields, but the header has 93"
+            "o.csv:4: has 93 fields, but the header has 94"
         );
         assert!(message("").contains("o.csv:1: seq: is missing"));
         assert!(

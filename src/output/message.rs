@@ -26,7 +26,7 @@
 //! | 80 | `u32` | `stereo_matches` | left–right matches |
 //! | 84 | `u32` | `tracks` | stereo matches found again from the pair before |
 //! | 88 | `u32` | `inliers` | tracks that the estimate rests on |
-//! | 92 | `u32` | `reserved` | 0 |
+//! | 92 | `u32` | `undetermined` | axes of the motion that the images leave open, as bits: 1, 2, 4 along x, y, z of the frame (σ above 0.1 m); 8, 16, 32 about them (above 0.01 rad); 63 where it was bridged |
 //! | 96 | `f64` | `variance_factor` | a-posteriori variance factor; not a number where nothing was measured |
 //! | 104 | `[f64; 3]` | `position_m` | of the frame in the odometry frame, m |
 //! | 128 | `[f64; 4]` | `orientation_xyzw` | of the frame in the odometry frame |
@@ -53,7 +53,7 @@
 
 use super::mounting::in_base_frame;
 use super::row::{canonical_xyzw, upper_triangle};
-use crate::estimation::{Odometry, Status};
+use crate::estimation::{Axes, Odometry, Status};
 #[cfg(feature = "ipc")]
 use iceoryx2::prelude::ZeroCopySend;
 use nalgebra::{Isometry3, Matrix6};
@@ -166,7 +166,7 @@ pub struct OdometryMessage {
     pub stereo_matches: u32,
     pub tracks: u32,
     pub inliers: u32,
-    pub reserved: u32,
+    pub undetermined: u32,
     pub variance_factor: f64,
     pub position_m: [f64; 3],
     pub orientation_xyzw: [f64; 4],
@@ -265,7 +265,7 @@ impl OdometryMessage {
             stereo_matches: odometry.counts.stereo_matches,
             tracks: odometry.counts.tracks,
             inliers: odometry.counts.inliers,
-            reserved: 0,
+            undetermined: odometry.undetermined().bits(),
             variance_factor: odometry.variance_factor,
             position_m: odometry.odom_from_camera.translation.vector.into(),
             orientation_xyzw: canonical_xyzw(&odometry.odom_from_camera.rotation),
@@ -301,6 +301,7 @@ impl OdometryMessage {
         )?;
         check_code("status", self.status, 3)?;
         check_code("frame", self.frame, 1)?;
+        check_code("undetermined", self.undetermined, Axes::ALL.bits())?;
         for (field, values) in self.float_fields() {
             if let Some(i) = values.iter().position(|v| !v.is_finite()) {
                 return Err(MessageError::Field {
@@ -505,7 +506,7 @@ pub(super) mod tests {
         let documented = documented_layout(include_str!("message.rs"));
         let actual = offsets!(OdometryMessage: magic version size flags sequence message_number
             realtime_ns monotonic_ns published_monotonic_ns epoch status frame budget_modelled
-            keypoints_left keypoints_right stereo_matches tracks inliers reserved variance_factor
+            keypoints_left keypoints_right stereo_matches tracks inliers undetermined variance_factor
             position_m orientation_xyzw motion_translation_m motion_rotation_xyzw twist cov_pose
             cov_motion cov_twist budget_detection budget_calibration budget_synchronisation
             budget_bridging latency_capture_ns latency_features_ns latency_matching_ns

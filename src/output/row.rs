@@ -1,7 +1,7 @@
 //! An estimate or a message in, named columns out: what the odometry CSV and `listen --json` share.
 
 use super::message::{OdometryMessage, flags};
-use crate::estimation::{Counts, Odometry, Status};
+use crate::estimation::{Axes, Counts, Odometry, Status};
 use nalgebra::{Isometry3, Matrix6, Quaternion, Translation3, UnitQuaternion};
 
 /// One row of the odometry CSV.
@@ -38,6 +38,8 @@ pub struct OdometryRow {
     pub budget_sigmas: [f64; 24],
     /// Whether the covariance describes the pose's error, to first order.
     pub is_first_order: bool,
+    /// Axes of the motion that the images leave open.
+    pub undetermined: Axes,
 }
 
 /// One value of a row.
@@ -97,10 +99,11 @@ impl OdometryRow {
                     .map(|(_, part)| std::array::from_fn(|i| part[(i, i)])),
             ),
             is_first_order: odometry.is_first_order(),
+            undetermined: odometry.undetermined(),
         }
     }
 
-    /// The row of a message; `None` if its status is not defined. The latency of a replay is left
+    /// The row of a message; `None` if its status, or an axis, is not defined. The latency of a replay is left
     /// out, as it is in the file.
     #[must_use]
     pub fn from_message(message: &OdometryMessage) -> Option<Self> {
@@ -130,6 +133,7 @@ impl OdometryRow {
                     .map(|(_, _, part)| DIAGONAL.map(|i| part[i])),
             ),
             is_first_order: message.flags & flags::BEYOND_FIRST_ORDER == 0,
+            undetermined: Axes::from_bits(message.undetermined)?,
         })
     }
 
@@ -157,6 +161,7 @@ impl OdometryRow {
             column(name, Float(sigma));
         }
         column("first_order", Integer(i128::from(self.is_first_order)));
+        column("undetermined", Integer(self.undetermined.bits().into()));
     }
 }
 

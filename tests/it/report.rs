@@ -3,7 +3,7 @@
 use nalgebra::{Isometry3, Matrix6};
 use std::path::Path;
 use std::process::{Command, Output};
-use visod::estimation::{Counts, Status};
+use visod::estimation::{Axes, Counts, Status};
 use visod::output::csv::OdometryCsvWriter;
 use visod::output::row::OdometryRow;
 
@@ -28,6 +28,7 @@ fn write_odometry(path: &Path, count: u64) {
             innovation_ratio: f64::NAN,
             budget_sigmas: std::array::from_fn(|i| 1e-4 * ((i % 5) as f64)),
             is_first_order: true,
+            undetermined: Axes::NONE,
         };
         writer.write_row(&row).unwrap();
     }

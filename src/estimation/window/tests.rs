@@ -4,7 +4,7 @@ use super::super::{Settings, StereoMeasurement};
 use super::*;
 use crate::simulation::{self, points};
 use crate::uncertainty::consistency;
-use nalgebra::{Vector2, Vector4, Vector6};
+use nalgebra::{Vector2, Vector3, Vector4, Vector6};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -383,4 +383,69 @@ fn every_covariance_is_one_under_ten_thousand_configurations() {
     }
     println!("{given} given, {refused} refused");
     assert!(given >= 10_000, "{given}, {refused}");
+}
+
+/// What two frames that see these points say of the motion between them.
+fn motion_by(points: &[Vector3<f64>]) -> Tracked {
+    let rig = simulation::thesis_rig();
+    let mut window = Window::new(rig.clone(), exact());
+    window.begin_at(
+        &Isometry3::identity(),
+        &(Matrix6::identity() * 1e-16),
+        &BySources::zeros(),
+    );
+    let seen_after = |motion: &Isometry3<f64>| -> Vec<Seen> {
+        let seen = (0..).zip(points).filter_map(|(id, point)| {
+            let inverse_depth = Vector3::new(point.x / point.z, point.y / point.z, 1.0 / point.z);
+            Some(Seen {
+                id,
+                measurement: StereoMeasurement {
+                    px: crate::estimation::seen_at(&rig, &motion.inverse(), &inverse_depth)?,
+                    sigma_px: Vector4::repeat(SIGMA_PX),
+                },
+                relief_px: Vector2::zeros(),
+            })
+        });
+        seen.collect()
+    };
+    window.promote(&seen_after(&Isometry3::identity()));
+    window.add(&step(), &seen_after(&step()));
+    window.adjust().expect("determined")
+}
+
+/// A hundred points, spread over what the cameras see from 0 to 1 across and down, at these depths.
+fn spread_over(at: impl Fn(f64, f64) -> Vector3<f64>) -> Vec<Vector3<f64>> {
+    let place = |n: u32| (f64::from(n % 10) / 9.0, f64::from(n / 10) / 9.0);
+    (0..100).map(place).map(|(u, v)| at(u, v)).collect()
+}
+
+fn in_view(u: f64, v: f64, depth_m: f64) -> Vector3<f64> {
+    Vector3::new(
+        (u - 0.5) * 0.6 * depth_m,
+        (v - 0.5) * 0.45 * depth_m,
+        depth_m,
+    )
+}
+
+#[test]
+fn what_the_points_leave_open_is_told_axis_by_axis() {
+    let open = |points: &[Vector3<f64>]| -> Vec<&str> {
+        let cov = motion_by(points).motion.cov_right;
+        crate::estimation::Axes::left_open_by(&cov)
+            .names()
+            .collect()
+    };
+    let depth = |u: f64, v: f64, near_m: f64, far_m: f64| {
+        near_m + (far_m - near_m) * ((7.0 * u + 3.0 * v) % 1.0)
+    };
+    let room = spread_over(|u, v| in_view(u, v, depth(u, v, 3.0, 20.0)));
+    assert_eq!(open(&room), [""; 0]);
+    // To two cameras a wall is enough.
+    assert_eq!(open(&spread_over(|u, v| in_view(u, v, 6.0))), [""; 0]);
+    // Mountains tell how the robot turns, and little of how it goes.
+    let mountains = spread_over(|u, v| in_view(u, v, depth(u, v, 3000.0, 10_000.0)));
+    assert_eq!(open(&mountains), ["x", "y", "z"]);
+    // Around a post the robot may have gone without seeing it.
+    let post = spread_over(|u, v| Vector3::new(0.01 * (u - 0.5), 2.0 * (v - 0.5), 6.0));
+    assert_eq!(open(&post), ["x", "ry"]);
 }

@@ -18,6 +18,7 @@ pub(super) const SCHEMA: &str = r#"{
     "sigma_motion_m": {"type": "number"},
     "variance_factor": {"type": "number"},
     "innovation_ratio": {"type": "number"},
+    "undetermined": {"type": "integer"},
     "budget_position_percent": {"type": "object"},
     "budget_rotation_percent": {"type": "object"},
     "latency_ms": {"type": "object"},
@@ -39,6 +40,7 @@ pub(super) fn of(estimate: &Odometry, latencies: &Latencies) -> Value {
         "sigma_motion_m": variance(&estimate.cov_motion, 0).sqrt(),
         "variance_factor": estimate.variance_factor,
         "innovation_ratio": estimate.innovation_ratio,
+        "undetermined": estimate.undetermined().bits(),
         "budget_position_percent": shares(estimate, 0),
         "budget_rotation_percent": shares(estimate, 3),
         "latency_ms": {

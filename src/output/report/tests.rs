@@ -1,7 +1,7 @@
 //! What every page must hold, however odd the run.
 
 use super::*;
-use crate::estimation::{Counts, Status};
+use crate::estimation::{Axes, Counts, Status};
 use crate::geometry::se3;
 use nalgebra::{Isometry3, Matrix6, Vector6};
 
@@ -35,6 +35,7 @@ fn rows(count: u64) -> Vec<OdometryRow> {
                 innovation_ratio: f64::NAN,
                 budget_sigmas: std::array::from_fn(|i| 1e-3 * ((i % 7) as f64) * sequence as f64),
                 is_first_order: true,
+                undetermined: Axes::NONE,
             };
             pose *= step;
             row
