@@ -21,7 +21,7 @@
 use super::Settings;
 use super::calibration::sight_by_rig;
 use super::window::WARP;
-use crate::geometry::product::product;
+use crate::geometry::product::{product, product_transposed};
 use crate::geometry::rig_parameters::{
     CAMERA_PARAMETERS, EXTRINSICS, RIG_PARAMETERS, RigCovariance, RigVector,
 };
@@ -104,14 +104,10 @@ impl RigErrors {
     /// the sources do to it; both of right perturbations.
     #[must_use]
     pub fn apart(&self, cov: &Matrix6<f64>, by: &BySources) -> Parts {
-        let of = |first: usize, count: usize| {
-            let columns = by.columns(first, count);
-            columns * columns.transpose()
-        };
-        let warp = of(WARP_COLUMNS, WARP);
+        let warp = squared::<WARP>(by, WARP_COLUMNS);
         let (detection, of_warp) = without(cov, &warp);
         let modes = if self.has_modes {
-            of(MODE_COLUMNS, MODES)
+            squared::<MODES>(by, MODE_COLUMNS)
         } else {
             Matrix6::zeros()
         };
@@ -121,7 +117,7 @@ impl RigErrors {
             modes
         };
         let synchronisation = if self.skew_counts {
-            of(SKEW_COLUMN, 1)
+            squared::<1>(by, SKEW_COLUMN)
         } else {
             Matrix6::zeros()
         };
@@ -131,6 +127,12 @@ impl RigErrors {
             synchronisation: se3::symmetric(&synchronisation),
         }
     }
+}
+
+/// The covariance that `COUNT` sources from `first` on give.
+fn squared<const COUNT: usize>(by: &BySources, first: usize) -> Matrix6<f64> {
+    let columns = by.fixed_columns::<COUNT>(first).into_owned();
+    product_transposed(&columns, &columns)
 }
 
 /// A covariance by source.
