@@ -235,7 +235,7 @@ fn growth() {
     let large = Recording::simulated(thesis_rig(), 4);
     let twice = enlarged(&large);
     let cases = [
-        ("640 × 480", Recording::simulated(small_rig(), 4), 1000),
+        ("320 × 240", Recording::simulated(small_rig(), 4), 1000),
         ("1280 × 960", large.clone(), 500),
         ("1280 × 960", large.clone(), 1000),
         ("1280 × 960", large.clone(), 2000),
@@ -290,7 +290,7 @@ fn enlarged(recording: &Recording) -> Recording {
 }
 
 fn endurance(pairs: u64) {
-    println!("\n### Endurance: {pairs} pairs of 640 × 480\n");
+    println!("\n### Endurance: {pairs} pairs of 320 × 240\n");
     println!("| pairs | processor ms a pair | resident MB |");
     println!("|---:|---:|---:|");
     let recording = Recording::simulated(small_rig(), FRAMES);
