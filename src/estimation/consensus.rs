@@ -84,12 +84,6 @@ impl Sighting {
         })
     }
 
-    /// Squared Mahalanobis distance of what is seen now from what a motion predicts, the variance factor being 1.
-    #[must_use]
-    pub fn squared_sigmas(&self, rig: &StereoRig, prev_from_now: &Isometry3<f64>) -> f64 {
-        Candidate::new(rig, self, Some(prev_from_now)).squared_sigmas(rig, &prev_from_now.inverse())
-    }
-
     fn is_displaced(&self) -> bool {
         let noise_px2 = self.now.sigma_px[3] * self.now.sigma_px[3];
         self.displacement_px2.trace() > NEGLIGIBLE * noise_px2

@@ -483,7 +483,7 @@ impl Windowed {
     }
 
     /// Seeks the landmarks that the detector has missed where the motion puts them, and adds what
-    /// it finds, and agrees with the motion, to `seen`.
+    /// it finds to `seen`.
     fn find_missed(&mut self, bench: &mut Workbench, newest_from_now: &Isometry3<f64>) {
         self.predict(bench, newest_from_now);
         let now_from_newest = newest_from_now.inverse();
@@ -496,19 +496,15 @@ impl Windowed {
             let found = bench.predicted[i]
                 .filter(|px| is_inside(&bench.rig, px))
                 .and_then(|start| self.seek(bench, i, &now_from_newest, &start, REACH_PX));
-            let Some(found) = found else {
-                continue;
-            };
-            let seen = window::Seen {
-                id,
-                measurement: found.measurement,
-                relief_px: found.relief_px,
-            };
-            if self.window.agrees(&seen, newest_from_now) {
-                let portrait = &mut self.gallery.portraits[i];
-                portrait.found = true;
+            let portrait = &mut self.gallery.portraits[i];
+            portrait.found = found.is_some();
+            if let Some(found) = found {
                 portrait.slant = found.slant;
-                self.seen.push(seen);
+                self.seen.push(window::Seen {
+                    id,
+                    measurement: found.measurement,
+                    relief_px: found.relief_px,
+                });
             }
         }
     }

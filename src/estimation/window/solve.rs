@@ -110,42 +110,28 @@ impl Window {
         found.filter(|_| agreed.len() >= self.settings.min_inliers as usize)
     }
 
-    /// The sights whose landmark lies in front of the newest frame.
+    /// The sights whose landmark lies in front of the newest frame, for the consensus.
     fn prepare(&self, seen: &[Seen], weights: &[f64], sightings: &mut Sightings) {
         sightings.indices.clear();
         sightings.prepared.clear();
+        let scale = 1.0 / self.variance.smoothed;
+        let cov_warp = self.cov_warp * scale;
         for ((i, s), &weight) in (0..).zip(seen).zip(weights) {
-            if let Some(sighting) = self.sighting(s, weight) {
+            let moved = self.landmark(s.id).and_then(|landmark| {
+                let newest_from_anchor = self.newest_from_anchor(landmark)?;
+                landmark.seen_from(&newest_from_anchor)
+            });
+            if let Some((inverse_depth, cov)) = moved {
                 sightings.indices.push(i);
-                sightings.prepared.push(sighting);
+                sightings.prepared.push(Sighting {
+                    inverse_depth,
+                    cov: cov * scale,
+                    now: self.warp.corrected(&s.measurement),
+                    displacement_px2: self.warp.displacement_px2(&s.measurement, &cov_warp),
+                    weight,
+                });
             }
         }
-    }
-
-    /// A sight for the consensus, its σ those that measurements have where the variance factor is 1. `None` where its
-    /// landmark does not lie in front of the newest frame.
-    fn sighting(&self, seen: &Seen, weight: f64) -> Option<Sighting> {
-        let scale = 1.0 / self.variance.smoothed;
-        let landmark = self.landmark(seen.id)?;
-        let newest_from_anchor = self.newest_from_anchor(landmark)?;
-        let (inverse_depth, cov) = landmark.seen_from(&newest_from_anchor)?;
-        let cov_warp = self.cov_warp * scale;
-        Some(Sighting {
-            inverse_depth,
-            cov: cov * scale,
-            now: self.warp.corrected(&seen.measurement),
-            displacement_px2: self.warp.displacement_px2(&seen.measurement, &cov_warp),
-            weight,
-        })
-    }
-
-    /// Whether a sight agrees with a motion, in units of the σ that is predicted for it. `newest_from_now` maps a point
-    /// of the left camera now into that of the newest frame.
-    #[must_use]
-    pub fn agrees(&self, seen: &Seen, newest_from_now: &Isometry3<f64>) -> bool {
-        let gate = self.settings.gate_sigma2 * self.variance.smoothed;
-        self.sighting(seen, 1.0)
-            .is_some_and(|s| s.squared_sigmas(&self.rig, newest_from_now) <= gate)
     }
 
     /// Adds the current frame, which stands at `newest_from_now`, with its sights of landmarks.
