@@ -4,7 +4,7 @@ use super::super::sources::BySources;
 use super::memory::{ByUnknowns, Unknowns, UnknownsBySources};
 use super::system::At;
 use super::warp::WARP;
-use super::{Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Window, row_of};
+use super::{Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Settings, Window, row_of};
 use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::se3;
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, Vector2, Vector6};
@@ -25,7 +25,10 @@ impl Window {
             let calibrated = self.warp.corrected(&s.measurement);
             let met = Landmark::new(&self.rig, s.id, newest, s.measurement, &calibrated);
             if let Some(landmark) = met {
-                let sights = self.spare_sights.pop().unwrap_or_else(room_for_sights);
+                let sights = self
+                    .spare_sights
+                    .pop()
+                    .unwrap_or_else(|| room_for_sights(&self.settings));
                 let first = Observation::new(newest, s);
                 self.landmarks
                     .push(landmark.with_first_sight(sights, first));
@@ -286,9 +289,9 @@ fn symmetrise(matrix: &mut DMatrix<f64>) {
     }
 }
 
-/// A list of sights that never has to grow.
-fn room_for_sights() -> Vec<Observation> {
-    Vec::with_capacity(MAX_FRAMES)
+/// A list of sights that never has to grow: every keyframe's, the last frame's and the current one's.
+pub(super) fn room_for_sights(settings: &Settings) -> Vec<Observation> {
+    Vec::with_capacity(settings.keyframes as usize + 2)
 }
 
 /// σ of a pose that nothing holds: m or rad.

@@ -56,6 +56,9 @@ const fn row_of(i: usize) -> usize {
 
 /// Frames in the window at most: keyframes, the last frame and the current one.
 const MAX_FRAMES: usize = 24;
+/// Landmarks that there is room for from the start, over those that are tracked at once: those of the last keyframes
+/// stay for a while after they were seen last.
+const LANDMARKS_PER_TRACKED: usize = 2;
 /// Unknowns of the warp and of poses at most.
 const MAX_UNKNOWNS: usize = row_of(MAX_FRAMES);
 
@@ -138,6 +141,10 @@ impl Window {
         let warp = Warp::new(&rig);
         let cov_warp = warp::prior_covariance(&rig, &settings);
         let prior = Prior::new(&warp, &cov_warp);
+        let landmarks = LANDMARKS_PER_TRACKED * settings.max_landmarks as usize;
+        let spare_sights = (0..landmarks)
+            .map(|_| keyframes::room_for_sights(&settings))
+            .collect();
         let warp_by_sources = cov_warp * prior.by_sources.fixed_rows::<WARP>(0);
         Self {
             prior,
@@ -155,7 +162,7 @@ impl Window {
                 &BySources::zeros(),
             ),
             frames: Vec::with_capacity(MAX_FRAMES),
-            landmarks: Vec::new(),
+            landmarks: Vec::with_capacity(landmarks),
             next_serial: 0,
             variance: VarianceFactor {
                 smoothed: 1.0,
@@ -167,7 +174,7 @@ impl Window {
             memory: Memory::default(),
             kept: State::default(),
             sightings: Sightings::default(),
-            spare_sights: Vec::new(),
+            spare_sights,
             squares: Vec::new(),
         }
     }
