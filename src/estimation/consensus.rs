@@ -7,6 +7,7 @@
 
 use super::bundle::TrackedPoint;
 use super::{StereoMeasurement, closed_form, sight};
+use crate::geometry::definite;
 use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{
@@ -96,7 +97,7 @@ fn unexplained(by_point: &Matrix4x3<f64>, now: &StereoMeasurement) -> Option<Mat
     let info = Matrix4::from_diagonal(&now.sigma_px.map(|s| 1.0 / (s * s)));
     let weighted = product(&info, by_point);
     let normal: Matrix3<f64> = transposed_product(&weighted, by_point);
-    let follow = product_transposed(&normal.cholesky()?.inverse(), &weighted);
+    let follow = product_transposed(&definite::inverse(&normal)?, &weighted);
     Some(Matrix4::identity() - product(by_point, &follow))
 }
 
@@ -267,7 +268,7 @@ impl Candidate {
             let by_right = left_over.fixed_columns::<2>(2).into_owned();
             cov += product_transposed(&product(&by_right, &p.displacement_px2), &by_right);
         }
-        Some(cov.cholesky()?.inverse())
+        definite::inverse(&cov)
     }
 
     /// Squared Mahalanobis distance of the present measurement from what a motion predicts.

@@ -21,7 +21,7 @@
 use super::Settings;
 use super::calibration::sight_by_rig;
 use super::window::WARP;
-use crate::geometry::product::{product, product_transposed};
+use crate::geometry::product::product_transposed;
 use crate::geometry::rig_parameters::{
     CAMERA_PARAMETERS, EXTRINSICS, RIG_PARAMETERS, RigCovariance, RigVector,
 };
@@ -41,17 +41,18 @@ pub const SKEW_COLUMN: usize = WARP + MODES;
 
 /// The derivative of a pose or motion (right perturbation) by each source, per σ of it.
 pub type BySources = SMatrix<f64, 6, SOURCES>;
-/// The derivative of (ul, vl, ur, vr) by the rig's modes, px per σ.
-pub type PxByModes = SMatrix<f64, 4, MODES>;
 
 /// How a rig may be wrong.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigErrors {
     /// Parameters by modes.
     root: SMatrix<f64, RIG_PARAMETERS, MODES>,
+    /// The same, transposed.
+    modes_by_parameters: SMatrix<f64, MODES, RIG_PARAMETERS>,
     /// Whether the warp's prior is an error of its own rather than another form of the modes.
     warp_counts: bool,
-    has_modes: bool,
+    /// How many of the modes there are: the others are zero.
+    modes: usize,
     skew_counts: bool,
 }
 
@@ -66,9 +67,13 @@ impl RigErrors {
             None => supposed(rig, settings.calibration_sigma_px),
         };
         Self {
-            has_modes: root.iter().any(|v| *v != 0.0),
+            modes: (0..MODES)
+                .rev()
+                .find(|mode| root.column(*mode).iter().any(|v| *v != 0.0))
+                .map_or(0, |last| last + 1),
             warp_counts: stated.is_none() || !settings.consider_calibration,
             skew_counts: settings.consider_synchronisation,
+            modes_by_parameters: root.transpose(),
             root,
         }
     }
@@ -76,19 +81,46 @@ impl RigErrors {
     /// Whether errors of parameters act at all.
     #[must_use]
     pub fn has_modes(&self) -> bool {
-        self.has_modes
+        self.modes > 0
     }
 
-    /// By how much the sight of the point `y` = (x, y, ρ) from a rig moved by `now_from_prev` is
-    /// displaced by each mode. `None` where a camera cannot see the point.
+    /// How many modes there are at most: those from there on are zero.
     #[must_use]
-    pub fn displacement(
+    pub fn modes(&self) -> usize {
+        self.modes
+    }
+
+    /// By how much the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from a rig moved by
+    /// `now_from_prev` is displaced by 1 σ of each mode, a row each, as many as there are `ROWS`. `None` where a
+    /// camera cannot see the point.
+    #[must_use]
+    #[inline(always)]
+    pub fn displacement<const ROWS: usize>(
         &self,
         rig: &StereoRig,
         now_from_prev: &Isometry3<f64>,
         y: &Vector3<f64>,
-    ) -> Option<PxByModes> {
-        Some(product(&sight_by_rig(rig, now_from_prev, y)?, &self.root))
+    ) -> Option<SMatrix<f64, ROWS, 4>> {
+        let by_rig = sight_by_rig(rig, now_from_prev, y)?;
+        // Neither camera's pixels depend on the other's lens, nor the left one's on where the right one is.
+        let parameters = [
+            0..CAMERA_PARAMETERS,
+            0..CAMERA_PARAMETERS,
+            CAMERA_PARAMETERS..RIG_PARAMETERS,
+            CAMERA_PARAMETERS..RIG_PARAMETERS,
+        ];
+        let mut by_modes = SMatrix::<f64, ROWS, 4>::zeros();
+        for (px, parameters) in parameters.into_iter().enumerate() {
+            let column = &mut by_modes.data.0[px];
+            for k in parameters {
+                let factor = by_rig.data.0[k][px];
+                let modes = &self.modes_by_parameters.data.0[k];
+                for (out, mode) in column.iter_mut().zip(modes) {
+                    *out += mode * factor;
+                }
+            }
+        }
+        Some(by_modes)
     }
 
     /// The derivative by the modes, of what has this derivative by the rig's parameters.
@@ -106,7 +138,7 @@ impl RigErrors {
     pub fn apart(&self, cov: &Matrix6<f64>, by: &BySources) -> Parts {
         let warp = squared::<WARP>(by, WARP_COLUMNS);
         let (detection, of_warp) = without(cov, &warp);
-        let modes = if self.has_modes {
+        let modes = if self.has_modes() {
             squared::<MODES>(by, MODE_COLUMNS)
         } else {
             Matrix6::zeros()
@@ -327,14 +359,14 @@ mod tests {
         );
         let ray = camera.unproject(&border).expect("has a ray");
         let by = errors
-            .displacement(&rig, &Isometry3::identity(), &ray.push(0.0))
+            .displacement::<MODES>(&rig, &Isometry3::identity(), &ray.push(0.0))
             .expect("in front");
         for mode in 0..3 {
-            let moved = by.fixed_view::<2, 1>(0, mode).norm();
+            let moved = by.fixed_view::<1, 2>(mode, 0).norm();
             assert!((moved - sigma_px).abs() < 1e-9, "{mode} {moved}");
         }
         // The baseline only shows in what is near.
-        assert!(by.column(4).norm() < 1e-12);
+        assert!(by.row(4).norm() < 1e-12);
     }
 
     proptest! {

@@ -2,7 +2,7 @@
 //!
 //! Frame: left camera, m. A measurement is (ul, vl, ur, vr), raw px.
 
-use crate::geometry::StereoRig;
+use crate::geometry::{StereoRig, definite};
 use crate::uncertainty::{derivative_of_minimiser, propagate};
 use nalgebra::{
     Matrix3, Matrix3x4, Matrix4, Matrix4x3, Point3, SMatrix, Vector2, Vector3, Vector4,
@@ -106,10 +106,9 @@ pub fn triangulate(rig: &StereoRig, measurement: &StereoMeasurement) -> Option<L
     let (_, jacobian) = rig.project_with_jacobian(&point)?;
     let (hessian, _) = normal_equations(&jacobian, &info, &Vector4::zeros());
     // With weights Σ_z⁻¹, −H⁻¹ ∂²C/∂y∂z Σ_z (…)ᵀ collapses to H⁻¹ (residuals being small).
-    let cov_m2 = hessian.cholesky()?.inverse();
     Some(Landmark {
         point,
-        cov_m2: (cov_m2 + cov_m2.transpose()) * 0.5,
+        cov_m2: definite::inverse(&hessian)?,
     })
 }
 

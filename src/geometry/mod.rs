@@ -9,6 +9,7 @@
 //! * A twist or a covariance is ordered translation, then rotation: x, y, z, rx, ry, rz.
 
 mod camera;
+pub(crate) mod definite;
 mod distortion;
 mod plausibility;
 pub(crate) mod product;

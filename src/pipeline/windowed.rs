@@ -93,11 +93,12 @@ impl Windowed {
         // As many as the window will ever hold, so that none has to be allocated on the way.
         let mut blank = Pyramid::default();
         blank.fill(&GrayImage::filled(rig.left.width, rig.left.height, 0));
+        let images = settings.keyframes as usize + 1;
         Self {
             window: Window::new(rig.clone(), settings.clone()),
             gallery: Gallery::default(),
-            images: Vec::new(),
-            spare_images: vec![blank; settings.keyframes as usize + 1],
+            images: Vec::with_capacity(images),
+            spare_images: vec![blank; images],
             next_id: 0,
             seen: Vec::new(),
             unsure: Vec::new(),

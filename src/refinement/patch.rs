@@ -6,6 +6,7 @@
 //! surface's slope is estimated along with the translation, by what is known of it before; a
 //! translation that stands for a slope would be off.
 
+use crate::geometry::definite;
 use crate::image::GrayImage;
 use crate::simd::widened;
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
@@ -203,7 +204,7 @@ impl Template {
         // Six parameters were fitted; template and target have half of the misfit each.
         let variance = left / (AREA - 6) as f64;
         let share = SHARED * (0.5 * variance + ROUNDING_VARIANCE);
-        let cov = (self.normal / share + self.known.0).cholesky()?.inverse();
+        let cov = definite::inverse(&(self.normal / share + self.known.0))?;
         let step = cov * (gradient / share + self.known.1);
         Some(Aligned {
             at: at - step.xy().map(|v| v as f32),
@@ -264,9 +265,7 @@ fn align_in(
     start: &Vector2<f32>,
     reach: f32,
 ) -> Option<Aligned> {
-    let inverse = (template.normal + template.known.0 * USUAL_VARIANCE)
-        .cholesky()?
-        .inverse();
+    let inverse = definite::inverse(&(template.normal + template.known.0 * USUAL_VARIANCE))?;
     let mut at = *start;
     let mut seen = [0.0; ROOM];
     for _ in 0..MAX_ITERATIONS {

@@ -142,18 +142,14 @@ fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
         }),
         ..visod::simulation::small_rig()
     };
-    let outcome = visod::montecarlo::run_corrupted(&rig, &Corruption::ALL, 1, 1, &|_| {}).unwrap();
+    let outcome = visod::montecarlo::run_corrupted(&rig, &Corruption::ALL, 2, 1, &|_| {}).unwrap();
     println!("{}", outcome.to_table());
-    assert!(outcome.total().corrupted > 200);
+    assert!(outcome.total().corrupted > 500);
     for (kind, tally) in &outcome.kinds {
         assert_eq!(tally.invalid, 0, "{kind}");
-        // What has begun anew in another place has to begin anew in this one.
-        let least = if *kind == Corruption::OtherPlace {
-            5
-        } else {
-            10
-        };
-        assert!(tally.tracking > least, "{kind} {}", tally.tracking);
+        // After five corrupted pairs in a row what was seen before them may be out of view until the odometry begins
+        // anew; of eighty pairs of two sequences that leaves enough.
+        assert!(tally.tracking > 30, "{kind} {}", tally.tracking);
         assert_eq!(tally.wrong_poses, 0, "{kind}");
         // A motion to or from images that are smeared, or shown in two parts, is wrong now and then: there the bench
         // counts.

@@ -25,11 +25,13 @@ use super::memory::{ByUnknowns, carried};
 use super::system::{self, At, POINT, weigh};
 use super::warp::WARP;
 use super::{Joint, MAX_FRAMES, row_of};
+use crate::geometry::definite::inverse;
 use crate::geometry::product::{
     product, product_transposed, transposed_product, transposed_scaled,
 };
 use crate::geometry::se3;
-use nalgebra::{Matrix6, SMatrix, SVector, Vector2, Vector6};
+use crate::simd::widened;
+use nalgebra::{Isometry3, Matrix6, SMatrix, SVector, Vector2, Vector6};
 
 /// Regions of the image, across and down.
 const REGIONS: [usize; 2] = [4, 3];
@@ -63,25 +65,47 @@ impl Region {
     }
 }
 
+/// How one frame sees the landmarks of one anchor.
+#[derive(Clone, Debug)]
+struct Sightline {
+    frame_from_anchor: Isometry3<f64>,
+    adjoint: Matrix6<f64>,
+    /// By how much the frame moves, relative to the anchor, with the newest pose.
+    moved: Block,
+}
+
+/// What one landmark's sights say of one frame's own pose.
+#[derive(Clone, Debug)]
+struct OfFrame {
+    frame: usize,
+    /// The information that joins it to the newest pose's direction.
+    by_direction: Block,
+    by_point: SMatrix<f64, 6, POINT>,
+}
+
 /// Follows the factor, in memory that it keeps.
 #[derive(Clone, Debug)]
 pub(super) struct Dispersion {
     smoothed: f64,
     taken: u32,
     regions: Vec<Region>,
-}
-
-impl Default for Dispersion {
-    fn default() -> Self {
-        Self {
-            smoothed: 1.0,
-            taken: 0,
-            regions: Vec::new(),
-        }
-    }
+    /// By anchor, then by frame; those that nothing was seen along are not made.
+    sightlines: Vec<Option<Sightline>>,
+    of_frames: Vec<OfFrame>,
 }
 
 impl Dispersion {
+    /// None as yet; room for a window of so many frames.
+    pub(super) fn with_room(frames: usize) -> Self {
+        Self {
+            smoothed: 1.0,
+            taken: 0,
+            regions: Vec::with_capacity(REGIONS[0] * REGIONS[1]),
+            sightlines: Vec::with_capacity(frames * frames),
+            of_frames: Vec::with_capacity(frames),
+        }
+    }
+
     /// The factor of a pose's covariance, its frame's relative to the datum: 1 or more.
     pub(super) fn factor(&self) -> f64 {
         (self.smoothed - CHANCE).max(1.0)
@@ -116,14 +140,16 @@ impl Dispersion {
         self.regions.clear();
         self.regions
             .resize_with(REGIONS[0] * REGIONS[1], Region::nothing);
+        self.sightlines.clear();
+        self.sightlines.resize(n * n, None);
         for landmark in landmarks {
             if let Some(last) = landmark.observations.last() {
                 let region = region_of(at, &last.measurement.left_px());
-                add(at, landmark, &along, &mut self.regions[region]);
+                add(self, at, landmark, &along, region);
             }
         }
         let information: Matrix6<f64> = self.regions.iter().map(|r| r.information).sum();
-        let scale = information.cholesky()?.inverse();
+        let scale = inverse(&information)?;
         let (mut squares, mut expected) = (0.0, 0.0);
         for region in &self.regions {
             squares += region.score.dot(&(scale * region.score));
@@ -144,8 +170,21 @@ fn region_of(at: &At<'_>, px: &Vector2<f64>) -> usize {
     cell(px.x, left.width, columns) + columns * cell(px.y, left.height, rows)
 }
 
-/// Adds what a landmark's sights say of the newest pose, `along` being by how much each pose moves with it.
-fn add(at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: &mut Region) {
+widened! {
+    /// Adds what a landmark's sights say of the newest pose to a region, `along` being by how much each pose
+    /// moves with it.
+    fn add = add_in,
+        (dispersion: &mut Dispersion, at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: usize)
+}
+
+#[inline(always)]
+fn add_in(
+    dispersion: &mut Dispersion,
+    at: &At<'_>,
+    landmark: &Landmark,
+    along: &[Block; MAX_FRAMES],
+    region: usize,
+) {
     let position = |serial: u64| at.frames.iter().position(|f| f.serial == serial);
     let Some(anchor) = position(landmark.anchor) else {
         return;
@@ -155,16 +194,22 @@ fn add(at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: &m
     let mut pose_point = SMatrix::<f64, 6, POINT>::zeros();
     let mut information = Matrix6::zeros();
     let mut score = Vector6::zeros();
-    // Of each frame's own pose: by the newest's direction, and by the point.
-    let mut by_direction = [Block::zeros(); MAX_FRAMES];
-    let mut by_point = [SMatrix::<f64, 6, POINT>::zeros(); MAX_FRAMES];
+    let mut of_anchor = OfFrame {
+        frame: anchor,
+        by_direction: Block::zeros(),
+        by_point: SMatrix::zeros(),
+    };
+    let of_frames = &mut dispersion.of_frames;
+    of_frames.clear();
     let mut sights = 0;
     for observation in &landmark.observations {
         let Some(frame) = position(observation.serial) else {
             continue;
         };
-        let from = at.frames[frame].datum_from_frame.inverse() * at.frames[anchor].datum_from_frame;
-        let Some(seen) = sight::linearise(at.rig, &from, &landmark.inverse_depth) else {
+        let line = dispersion.sightlines[anchor * at.frames.len() + frame]
+            .get_or_insert_with(|| sightline(at, anchor, frame, along));
+        let Some(seen) = sight::linearise(at.rig, &line.frame_from_anchor, &landmark.inverse_depth)
+        else {
             continue;
         };
         sights += 1;
@@ -182,40 +227,53 @@ fn add(at: &At<'_>, landmark: &Landmark, along: &[Block; MAX_FRAMES], region: &m
         if frame == anchor {
             continue;
         }
-        let carry = se3::adjoint(&from);
-        let moved = along[frame] - product(&carry, &along[anchor]);
-        let seen_by_direction = product(&seen.by_motion, &moved);
+        let seen_by_direction = product(&seen.by_motion, &line.moved);
         let weighted = transposed_scaled(&seen_by_direction, &info);
         information += product(&weighted, &seen_by_direction);
         score += product(&weighted, &residual);
         pose_point += product(&weighted, &seen_by_point);
         let weighted = transposed_scaled(&seen.by_motion, &info);
-        let (direction, point) = (
-            product(&weighted, &seen_by_direction),
-            product(&weighted, &seen_by_point),
-        );
-        by_direction[frame] += direction;
-        by_direction[anchor] -= transposed_product(&carry, &direction);
-        by_point[frame] += point;
-        by_point[anchor] -= transposed_product(&carry, &point);
+        let own = OfFrame {
+            frame,
+            by_direction: product(&weighted, &seen_by_direction),
+            by_point: product(&weighted, &seen_by_point),
+        };
+        of_anchor.by_direction -= transposed_product(&line.adjoint, &own.by_direction);
+        of_anchor.by_point -= transposed_product(&line.adjoint, &own.by_point);
+        of_frames.push(own);
     }
     if sights < 2 {
         return;
     }
+    of_frames.push(of_anchor);
     for i in 0..2 {
         point_point[(3 + i, 3 + i)] += 1.0 / at.variance_factor;
         point_gradient[3 + i] -= landmark.relief[i] / at.variance_factor;
     }
-    let Some(factor) = point_point.cholesky() else {
+    let Some(cov_point) = inverse(&point_point) else {
         return;
     };
-    let through_point = product(&pose_point, &factor.inverse());
+    let region = &mut dispersion.regions[region];
+    let through_point = product(&pose_point, &cov_point);
     region.score += score - product(&through_point, &point_gradient);
     region.information += information - product_transposed(&through_point, &pose_point);
-    for f in 1..at.frames.len() {
-        let block = by_direction[f].transpose() - product_transposed(&through_point, &by_point[f]);
-        let mut columns = region.by_unknowns.fixed_columns_mut::<6>(row_of(f));
+    // The datum has no unknowns.
+    for own in of_frames.iter().filter(|own| own.frame > 0) {
+        let block =
+            own.by_direction.transpose() - product_transposed(&through_point, &own.by_point);
+        let mut columns = region.by_unknowns.fixed_columns_mut::<6>(row_of(own.frame));
         columns += block;
+    }
+}
+
+fn sightline(at: &At<'_>, anchor: usize, frame: usize, along: &[Block; MAX_FRAMES]) -> Sightline {
+    let frame_from_anchor =
+        at.frames[frame].datum_from_frame.inverse() * at.frames[anchor].datum_from_frame;
+    let adjoint = se3::adjoint(&frame_from_anchor);
+    Sightline {
+        moved: along[frame] - product(&adjoint, &along[anchor]),
+        frame_from_anchor,
+        adjoint,
     }
 }
 
@@ -228,7 +286,7 @@ impl GivenWarp {
     fn new(joint: &Joint) -> Option<Self> {
         let cov = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
         Some(Self {
-            warp_information: cov.cholesky()?.inverse(),
+            warp_information: inverse(&cov)?,
         })
     }
 

@@ -4,7 +4,9 @@ use super::super::sources::BySources;
 use super::memory::{ByUnknowns, Unknowns, UnknownsBySources};
 use super::system::At;
 use super::warp::WARP;
-use super::{Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Settings, Window, row_of};
+use super::{
+    Landmark, MAX_FRAMES, MAX_UNKNOWNS, Observation, Seen, Settings, Window, frames_of, row_of,
+};
 use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::se3;
 use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, Vector2, Vector6};
@@ -36,6 +38,7 @@ impl Window {
         }
         // An id may come back after its landmark was given up.
         self.landmarks.sort_unstable_by_key(|l| l.id);
+        self.retire_landmarks();
         let seen = self
             .landmarks
             .iter()
@@ -100,30 +103,12 @@ impl Window {
             return;
         }
         let oldest = self.frames[0].serial;
-        let mut system = std::mem::take(&mut self.system);
-        let leaving = self
-            .landmarks
-            .iter()
-            .enumerate()
-            .filter(|(_, l)| l.anchor == oldest);
-        let at = At {
-            without: Some(newest),
-            ..At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed)
-        };
-        system.build(&at, leaving);
-        let (mut hessian, mut gradient) = system.assemble(&mut self.memory);
-        let mut by_sources =
-            self.sensitivity
-                .right_side(&at, &self.errors, &system, &self.landmarks);
-        self.system = system;
+        let leaving = |l: &Landmark| l.anchor == oldest;
+        let (mut hessian, mut gradient, mut by_sources) = self.said_by(leaving, Some(newest));
         if let Some(ground) = &self.ground {
             ground.add_to(&self.frames[..2], &mut hessian, &mut gradient);
         }
-        // From "at the current poses" to "counted from where they are linearised".
-        let offsets = self.prior.offsets(&self.warp, &self.frames);
-        for (column, offset) in hessian.column_iter().zip(&offsets) {
-            gradient.axpy(*offset, &column, 1.0);
-        }
+        self.count_from_linearised(&hessian, &mut gradient);
         let m = self.prior.vector.len();
         let mut top = hessian.view_mut((0, 0), (m, m));
         top += &self.prior.information;
@@ -134,6 +119,46 @@ impl Window {
         self.memory.recycle(hessian);
         self.memory.recycle_vector(gradient);
         self.restart_landmarks(oldest, newest);
+    }
+
+    /// What those of the landmarks that are `leaving` say of warp and poses, these standing where they do:
+    /// information, right side, and by how much that moves with each source of error. `without` is a frame
+    /// whose sights are left out.
+    pub(super) fn said_by(
+        &mut self,
+        leaving: impl Fn(&Landmark) -> bool,
+        without: Option<u64>,
+    ) -> (DMatrix<f64>, DVector<f64>, UnknownsBySources) {
+        let mut system = std::mem::take(&mut self.system);
+        let at = At {
+            without,
+            ..At::new(&self.rig, &self.warp, &self.frames, self.variance.smoothed)
+        };
+        let leaving = self
+            .landmarks
+            .iter()
+            .enumerate()
+            .filter(|(_, l)| leaving(l));
+        system.build(&at, leaving);
+        let (hessian, gradient) = system.assemble(&mut self.memory);
+        let by_sources = self
+            .sensitivity
+            .right_side(&at, &self.errors, &system, &self.landmarks);
+        self.system = system;
+        (hessian, gradient, by_sources)
+    }
+
+    /// Takes a right side from "at the current poses" to "counted from where they are linearised", as the
+    /// prior's is.
+    pub(super) fn count_from_linearised(
+        &self,
+        hessian: &DMatrix<f64>,
+        gradient: &mut DVector<f64>,
+    ) {
+        let offsets = self.prior.offsets(&self.warp, &self.frames);
+        for (column, offset) in hessian.column_iter().zip(&offsets) {
+            gradient.axpy(*offset, &column, 1.0);
+        }
     }
 
     /// Expresses everything relative to frame 1 and eliminates its pose.
@@ -291,7 +316,7 @@ fn symmetrise(matrix: &mut DMatrix<f64>) {
 
 /// A list of sights that never has to grow: every keyframe's, the last frame's and the current one's.
 pub(super) fn room_for_sights(settings: &Settings) -> Vec<Observation> {
-    Vec::with_capacity(settings.keyframes as usize + 2)
+    Vec::with_capacity(frames_of(settings))
 }
 
 /// σ of a pose that nothing holds: m or rad.

@@ -18,7 +18,15 @@ pub(super) type UnknownsBySources = SMatrix<f64, MAX_UNKNOWNS, SOURCES>;
 #[derive(Clone, Debug, Default)]
 pub(super) struct Memory(Vec<Vec<f64>>);
 
+/// How many are in use at once at most.
+const STOCK: usize = 10;
+
 impl Memory {
+    /// As many as are ever needed at once, so that none has to be made on the way.
+    pub(super) fn stocked() -> Self {
+        Self((0..STOCK).map(|_| room()).collect())
+    }
+
     /// A square matrix of zeros.
     pub(super) fn square(&mut self, n: usize) -> DMatrix<f64> {
         DMatrix::from_vec(n, n, self.zeros(n * n))
@@ -40,14 +48,15 @@ impl Memory {
     }
 
     fn zeros(&mut self, len: usize) -> Vec<f64> {
-        let mut values = self
-            .0
-            .pop()
-            .unwrap_or_else(|| Vec::with_capacity(MAX_UNKNOWNS * MAX_UNKNOWNS));
+        let mut values = self.0.pop().unwrap_or_else(room);
         values.clear();
         values.resize(len, 0.0);
         values
     }
+}
+
+fn room() -> Vec<f64> {
+    Vec::with_capacity(MAX_UNKNOWNS * MAX_UNKNOWNS)
 }
 
 /// `by · cov · byᵀ`, for the unknowns that `cov` has.

@@ -24,6 +24,7 @@ mod landmark;
 mod memory;
 mod planar;
 mod prior;
+mod retirement;
 mod sensitivity;
 mod solve;
 mod system;
@@ -56,6 +57,10 @@ const fn row_of(i: usize) -> usize {
 
 /// Frames in the window at most: keyframes, the last frame and the current one.
 const MAX_FRAMES: usize = 24;
+/// The same with these settings.
+const fn frames_of(settings: &Settings) -> usize {
+    settings.keyframes as usize + 2
+}
 /// Landmarks that there is room for from the start, over those that are tracked at once: those of the last keyframes
 /// stay for a while after they were seen last.
 const LANDMARKS_PER_TRACKED: usize = 2;
@@ -73,6 +78,8 @@ struct Frame {
     is_keyframe: bool,
     /// Landmarks seen when it became a keyframe.
     landmarks: usize,
+    /// Sights of landmarks whose word the prior has by now.
+    retired_sights: u32,
     /// How its two images were taken.
     exposure: Exposure,
 }
@@ -142,6 +149,7 @@ impl Window {
         let cov_warp = warp::prior_covariance(&rig, &settings);
         let prior = Prior::new(&warp, &cov_warp);
         let landmarks = LANDMARKS_PER_TRACKED * settings.max_landmarks as usize;
+        let frames = frames_of(&settings);
         let spare_sights = (0..landmarks)
             .map(|_| keyframes::room_for_sights(&settings))
             .collect();
@@ -150,7 +158,7 @@ impl Window {
             prior,
             errors: RigErrors::of(&rig, &settings),
             ground: Ground::of(&rig, &settings),
-            sensitivity: Sensitivity::default(),
+            sensitivity: Sensitivity::with_room(frames),
             rig,
             warp,
             cov_warp,
@@ -168,14 +176,14 @@ impl Window {
                 smoothed: 1.0,
                 frames: 0,
             },
-            dispersion: Dispersion::default(),
+            dispersion: Dispersion::with_room(frames),
             cov_second: Matrix6::zeros(),
-            system: System::default(),
-            memory: Memory::default(),
-            kept: State::default(),
-            sightings: Sightings::default(),
+            system: System::with_room(frames, landmarks),
+            memory: Memory::stocked(),
+            kept: State::with_room(frames, landmarks),
+            sightings: Sightings::with_room(landmarks),
             spare_sights,
-            squares: Vec::new(),
+            squares: Vec::with_capacity(frames * landmarks),
         }
     }
 

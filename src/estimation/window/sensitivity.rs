@@ -11,24 +11,42 @@ use super::super::sources::{MODE_COLUMNS, MODES, RigErrors, SKEW_COLUMN};
 use super::landmark::Landmark;
 use super::memory::UnknownsBySources;
 use super::row_of;
-use super::system::{self, At, POINT, System, weigh};
+use super::system::{self, At, POINT, Reduced, System, weigh};
 use super::warp::WARP;
-use crate::geometry::product::{product, transposed_product};
-use nalgebra::SMatrix;
+use crate::geometry::product::{product, subtract_product_transposed};
+use crate::simd::widened;
+use nalgebra::{Isometry3, SMatrix, Vector3};
 
-/// Columns that displace sights: the modes and the skew.
-const MOVING: usize = MODES + 1;
-type Block6 = SMatrix<f64, 6, MOVING>;
-type Block4 = SMatrix<f64, 4, MOVING>;
+/// Rows for the sources that displace sights: the modes, then, last, the skew. Few do for a rig that states
+/// nothing of its uncertainty.
+const FEW: usize = 8;
+const ALL: usize = MODES + 1;
 
 /// Working memory.
-#[derive(Clone, Debug, Default)]
+#[derive(Clone, Debug)]
 pub(super) struct Sensitivity {
-    lines: Vec<Block6>,
-    frames: Vec<Block6>,
+    few: Gathered<FEW>,
+    all: Gathered<ALL>,
+}
+
+/// What the sources, a row each, so that products run along them, do to the right side.
+#[derive(Clone, Debug)]
+struct Gathered<const ROWS: usize> {
+    /// To the sights of a frame, by their anchor, then by the frame.
+    lines: Vec<SMatrix<f64, ROWS, 6>>,
+    frames: Vec<SMatrix<f64, ROWS, 6>>,
+    warp: SMatrix<f64, ROWS, WARP>,
 }
 
 impl Sensitivity {
+    /// Room for a window of so many frames.
+    pub(super) fn with_room(frames: usize) -> Self {
+        Self {
+            few: Gathered::with_room(frames),
+            all: Gathered::with_room(frames),
+        }
+    }
+
     /// The derivative of the right side of `system`, which was built at `at`, by each source: rows
     /// as there.
     pub(super) fn right_side(
@@ -38,113 +56,154 @@ impl Sensitivity {
         system: &System,
         landmarks: &[Landmark],
     ) -> UnknownsBySources {
-        let n = at.frames.len();
-        let mut right = UnknownsBySources::zeros();
         let has_skew = at.frames.iter().any(|f| f.exposure.sigma_skew_s > 0.0);
         if !errors.has_modes() && !has_skew {
-            return right;
+            return UnknownsBySources::zeros();
         }
-        self.lines.clear();
-        self.lines.resize(n * n, Block6::zeros());
-        self.frames.clear();
-        self.frames.resize(n, Block6::zeros());
-        let mut warp = SMatrix::<f64, WARP, MOVING>::zeros();
-        for reduced in system.reduced() {
-            let landmark = &landmarks[reduced.landmark];
-            let Some(anchor) = at.frames.iter().position(|f| f.serial == landmark.anchor) else {
-                continue;
-            };
-            let mut by_point = SMatrix::<f64, POINT, MOVING>::zeros();
-            for observation in &landmark.observations {
-                if Some(observation.serial) == at.without {
-                    continue;
-                }
-                let Some(frame) = at
-                    .frames
-                    .iter()
-                    .position(|f| f.serial == observation.serial)
-                else {
-                    continue;
-                };
-                let (current, linearised) = system.sightline(anchor, frame);
-                let from = linearised.unwrap_or(current);
-                let y = &landmark.inverse_depth;
-                let (Some(seen), Some(px)) = (
-                    sight::linearise(at.rig, from, y),
-                    sight::seen_at(at.rig, current, y),
-                ) else {
-                    continue;
-                };
-                let Some(displaced) = displacement(at, errors, frame, from, y) else {
-                    continue;
-                };
-                let residual = at.warp.corrected(&observation.measurement).px
-                    - px
-                    - observation.by_relief(&landmark.relief);
-                let (info, _, _) = weigh(
-                    &residual,
-                    &observation.measurement.sigma_px,
-                    at.variance_factor,
-                );
-                let mut weighted = displaced;
-                for i in 0..4 {
-                    weighted.row_mut(i).scale_mut(info[i]);
-                }
-                by_point += transposed_product(&system::by_point(&seen, observation), &weighted);
-                let by_warp = at.warp.derivative(&observation.measurement);
-                warp += by_warp.transpose() * weighted.fixed_rows::<2>(2);
-                if frame != anchor {
-                    self.lines[anchor * n + frame] +=
-                        transposed_product(&seen.by_motion, &weighted);
-                }
-            }
-            let gain = product(&reduced.cov, &by_point);
-            for cross in system.crosses_of(reduced) {
-                self.frames[cross.frame] -= product(&cross.by_point, &gain);
-            }
-            warp -= product(&reduced.by_warp, &gain);
-        }
-        self.expand(system, n);
-        right
-            .view_mut((0, MODE_COLUMNS), (WARP, MOVING))
-            .copy_from(&warp);
-        for i in 1..n {
-            right
-                .view_mut((row_of(i), MODE_COLUMNS), (6, MOVING))
-                .copy_from(&self.frames[i]);
-        }
-        right
-    }
-
-    /// Hands on what the sightlines gathered to the poses at their two ends.
-    fn expand(&mut self, system: &System, n: usize) {
-        for anchor in 0..n {
-            for frame in (0..n).filter(|frame| *frame != anchor) {
-                let line = self.lines[anchor * n + frame];
-                self.frames[frame] += line;
-                self.frames[anchor] -= transposed_product(system.adjoint(anchor, frame), &line);
-            }
+        let landmarks = system.reduced().iter().map(|r| (r, &landmarks[r.landmark]));
+        let n = at.frames.len();
+        if errors.modes() < FEW {
+            self.few.begin(n);
+            landmarks.for_each(|(r, l)| gather_few(&mut self.few, at, errors, system, r, l));
+            self.few.right_side(system, n)
+        } else {
+            self.all.begin(n);
+            landmarks.for_each(|(r, l)| gather_all(&mut self.all, at, errors, system, r, l));
+            self.all.right_side(system, n)
         }
     }
 }
 
+impl<const ROWS: usize> Gathered<ROWS> {
+    fn with_room(frames: usize) -> Self {
+        Self {
+            lines: Vec::with_capacity(frames * frames),
+            frames: Vec::with_capacity(frames),
+            warp: SMatrix::zeros(),
+        }
+    }
+
+    fn begin(&mut self, n: usize) {
+        self.lines.clear();
+        self.lines.resize(n * n, SMatrix::zeros());
+        self.frames.clear();
+        self.frames.resize(n, SMatrix::zeros());
+        self.warp = SMatrix::zeros();
+    }
+
+    /// Hands on what the sightlines gathered to the poses at their two ends.
+    fn right_side(&mut self, system: &System, n: usize) -> UnknownsBySources {
+        for anchor in 0..n {
+            for frame in (0..n).filter(|frame| system.is_seen_along(anchor, *frame)) {
+                let line = &self.lines[anchor * n + frame];
+                self.frames[frame] += line;
+                self.frames[anchor] -= product(line, system.adjoint(anchor, frame));
+            }
+        }
+        let mut right = UnknownsBySources::zeros();
+        for row in 0..ROWS {
+            let source = if row == ROWS - 1 {
+                SKEW_COLUMN
+            } else {
+                MODE_COLUMNS + row
+            };
+            for i in 0..WARP {
+                right[(i, source)] = self.warp[(row, i)];
+            }
+            for (frame, by_pose) in self.frames.iter().enumerate().skip(1) {
+                for i in 0..6 {
+                    right[(row_of(frame) + i, source)] = by_pose[(row, i)];
+                }
+            }
+        }
+        right
+    }
+}
+
+widened! {
+    fn gather_few = gather::<FEW>,
+        (gathered: &mut Gathered<FEW>, at: &At<'_>, errors: &RigErrors, system: &System, reduced: &Reduced, landmark: &Landmark)
+}
+
+widened! {
+    fn gather_all = gather::<ALL>,
+        (gathered: &mut Gathered<ALL>, at: &At<'_>, errors: &RigErrors, system: &System, reduced: &Reduced, landmark: &Landmark)
+}
+
+/// Adds what the sources do to one landmark's sights, its point eliminated.
+#[inline(always)]
+fn gather<const ROWS: usize>(
+    gathered: &mut Gathered<ROWS>,
+    at: &At<'_>,
+    errors: &RigErrors,
+    system: &System,
+    reduced: &Reduced,
+    landmark: &Landmark,
+) {
+    let position = |serial: u64| at.frames.iter().position(|f| f.serial == serial);
+    let Some(anchor) = position(landmark.anchor) else {
+        return;
+    };
+    let y = &landmark.inverse_depth;
+    let mut by_point = SMatrix::<f64, ROWS, POINT>::zeros();
+    for observation in &landmark.observations {
+        if Some(observation.serial) == at.without {
+            continue;
+        }
+        let Some(frame) = position(observation.serial) else {
+            continue;
+        };
+        let (current, linearised) = system.sightline(anchor, frame);
+        let from = linearised.unwrap_or(current);
+        let (Some(seen), Some(px)) = (
+            sight::linearise(at.rig, from, y),
+            sight::seen_at(at.rig, current, y),
+        ) else {
+            continue;
+        };
+        let Some(displaced) = displacement::<ROWS>(at, errors, frame, from, y) else {
+            continue;
+        };
+        let residual = at.warp.corrected(&observation.measurement).px
+            - px
+            - observation.by_relief(&landmark.relief);
+        let (info, _, _) = weigh(
+            &residual,
+            &observation.measurement.sigma_px,
+            at.variance_factor,
+        );
+        let mut weighted = displaced;
+        for (mut column, info) in weighted.column_iter_mut().zip(&info) {
+            column *= *info;
+        }
+        by_point += product(&weighted, &system::by_point(&seen, observation));
+        let of_right = weighted.fixed_columns::<2>(2).into_owned();
+        gathered.warp += product(&of_right, &at.warp.derivative(&observation.measurement));
+        if frame != anchor {
+            gathered.lines[anchor * at.frames.len() + frame] += product(&weighted, &seen.by_motion);
+        }
+    }
+    let gain = product(&by_point, &reduced.cov);
+    for cross in system.crosses_of(reduced) {
+        subtract_product_transposed(&mut gathered.frames[cross.frame], &gain, &cross.by_point);
+    }
+    subtract_product_transposed(&mut gathered.warp, &gain, &reduced.by_warp);
+}
+
 /// By how much each source that moves sights displaces that of `y` from a frame.
-fn displacement(
+#[inline(always)]
+fn displacement<const ROWS: usize>(
     at: &At<'_>,
     errors: &RigErrors,
     frame: usize,
-    from: &nalgebra::Isometry3<f64>,
-    y: &nalgebra::Vector3<f64>,
-) -> Option<Block4> {
-    let mut by = Block4::zeros();
-    if errors.has_modes() {
-        by.fixed_columns_mut::<MODES>(0)
-            .copy_from(&errors.displacement(at.rig, from, y)?);
-    }
+    from: &Isometry3<f64>,
+    y: &Vector3<f64>,
+) -> Option<SMatrix<f64, ROWS, 4>> {
+    let mut by = errors.displacement::<ROWS>(at.rig, from, y)?;
     let exposure = &at.frames[frame].exposure;
     if exposure.sigma_skew_s > 0.0 {
         let skew = sight_by_skew(at.rig, from, y, &exposure.twist)? * exposure.sigma_skew_s;
-        by.set_column(SKEW_COLUMN - MODE_COLUMNS, &skew);
+        by.set_row(ROWS - 1, &skew.transpose());
     }
     Some(by)
 }

@@ -11,6 +11,7 @@ use super::prior::Prior;
 use super::system::{At, System};
 use super::warp::WARP;
 use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
+use crate::geometry::definite::inverse_from_factor;
 use crate::geometry::product::product;
 use crate::geometry::se3;
 use nalgebra::{
@@ -35,13 +36,35 @@ pub(super) struct State {
     points: Vec<(Vector3<f64>, Vector2<f64>)>,
 }
 
+impl Sightings {
+    /// Room for sights of so many landmarks.
+    pub(super) fn with_room(landmarks: usize) -> Self {
+        Self {
+            indices: Vec::with_capacity(landmarks),
+            prepared: Vec::with_capacity(landmarks),
+            ..Self::default()
+        }
+    }
+}
+
+impl State {
+    /// Room for a window of so many frames and landmarks.
+    pub(super) fn with_room(frames: usize, landmarks: usize) -> Self {
+        Self {
+            frames: Vec::with_capacity(frames),
+            points: Vec::with_capacity(landmarks),
+            ..Self::default()
+        }
+    }
+}
+
 /// Damping beyond which no step will help.
 const MAX_DAMPING: f64 = 1e3;
 /// Iterations of Levenberg and Marquardt at most.
 const MAX_ITERATIONS: usize = 12;
-/// The gain in cost, σ², of a step that may be the last: at most a tenth of the σ of any pose. What would
-/// follow is a small part of it.
-const LAST_GAIN: f64 = 5e-3;
+/// The gain in cost, σ², of a step that may be the last: at most a fifth of the σ of any pose. What would
+/// follow is a tenth of that at most, for steps near the end converge quadratically.
+const LAST_GAIN: f64 = 2e-2;
 /// Steps before the newest frame's sights are judged for the first time: while wrong ones pull, steps are
 /// many and small.
 const ROUGH_STEPS: usize = 1;
@@ -73,6 +96,7 @@ impl Window {
             linearised: None,
             is_keyframe: true,
             landmarks: 0,
+            retired_sights: 0,
             exposure: Exposure::default(),
         });
     }
@@ -147,6 +171,7 @@ impl Window {
             linearised: None,
             is_keyframe: false,
             landmarks: 0,
+            retired_sights: 0,
             exposure: Exposure::default(),
         });
         for s in seen {
@@ -204,14 +229,15 @@ impl Window {
     fn adjust_and_judge(&mut self) -> Option<Tracked> {
         self.approach();
         self.judge_newest();
-        let mut joint = self.solve()?;
+        let mut factor = self.solve()?;
         for _ in 1..ROUNDS {
             if self.judge_newest() == 0 {
                 break;
             }
-            self.memory.recycle(joint);
-            joint = self.solve()?;
+            self.memory.recycle(factor.unpack_dirty());
+            factor = self.solve()?;
         }
+        let joint = self.joint_covariance(factor);
         let tracked = self.conclude(&joint);
         self.memory.recycle(joint);
         tracked
@@ -260,16 +286,22 @@ impl Window {
         });
     }
 
-    /// Adjusts warp, poses and landmarks; the joint covariance of warp and poses at the optimum.
-    fn solve(&mut self) -> Option<Joint> {
+    /// Adjusts warp, poses and landmarks; the information of warp and poses at the optimum, factored.
+    fn solve(&mut self) -> Option<Cholesky<f64, Dyn>> {
         self.with_working_memory(|window, system, memory| {
-            let factor = window.iterate(system, memory, MAX_ITERATIONS)?;
-            let mut joint = memory.square(factor.l_dirty().nrows());
-            joint.fill_with_identity();
-            factor.solve_mut(&mut joint);
-            memory.recycle(factor.unpack_dirty());
-            Some(joint)
+            window.iterate(system, memory, MAX_ITERATIONS)
         })
+    }
+
+    /// The covariance to an information, which was factored.
+    fn joint_covariance(&mut self, factor: Cholesky<f64, Dyn>) -> Joint {
+        let lower = factor.unpack_dirty();
+        let mut room = self.memory.square(lower.nrows());
+        let mut joint = self.memory.square(lower.nrows());
+        inverse_from_factor(&lower, &mut room, &mut joint);
+        self.memory.recycle(lower);
+        self.memory.recycle(room);
+        joint
     }
 
     /// Lends the working memory of an adjustment, which belongs to the window.
@@ -364,7 +396,7 @@ impl Window {
     }
 
     /// The equations at the present state, the prior included, and the cost.
-    fn equations(
+    pub(super) fn equations(
         &self,
         system: &mut System,
         memory: &mut Memory,
@@ -467,6 +499,9 @@ impl Window {
         let newest = self.newest_serial()?;
         let mut freedom = 0.0;
         let mut counted = [[0_u32; 2]; MAX_FRAMES];
+        for ([_, all], frame) in counted.iter_mut().zip(&self.frames) {
+            *all = frame.retired_sights;
+        }
         let mut squares = std::mem::take(&mut self.squares);
         squares.clear();
         for (i, landmark) in self.landmarks.iter().enumerate() {

@@ -9,6 +9,7 @@ use super::landmark::{Landmark, Observation};
 use super::memory::Memory;
 use super::warp::{WARP, Warp};
 use super::{Frame, row_of};
+use crate::geometry::definite::inverse;
 use crate::geometry::product::{
     product, subtract_product_transposed, transposed_product, transposed_scaled,
 };
@@ -102,6 +103,19 @@ pub(super) struct Cross {
 }
 
 impl System {
+    /// Room for a window of so many frames and landmarks.
+    pub(super) fn with_room(frames: usize, landmarks: usize) -> Self {
+        Self {
+            sightlines: Vec::with_capacity(frames * frames),
+            blocks: Vec::with_capacity(frames * frames),
+            gradients: Vec::with_capacity(frames),
+            by_warp: Vec::with_capacity(frames),
+            reduced: Vec::with_capacity(landmarks),
+            crosses: Vec::with_capacity(frames * landmarks),
+            ..Self::default()
+        }
+    }
+
     /// Linearises the observations of `landmarks`. Returns the robust cost, in σ².
     pub(super) fn build<'a>(
         &mut self,
@@ -140,6 +154,11 @@ impl System {
     /// The adjoint of that.
     pub(super) fn adjoint(&self, anchor: usize, frame: usize) -> &Matrix6<f64> {
         &self.sightlines[anchor * self.frame_count + frame].adjoint
+    }
+
+    /// Whether a frame saw landmarks of an anchor other than itself.
+    pub(super) fn is_seen_along(&self, anchor: usize, frame: usize) -> bool {
+        self.sightlines[anchor * self.frame_count + frame].is_used
     }
 
     fn begin(&mut self, frames: &[Frame]) {
@@ -357,7 +376,7 @@ fn eliminate_in(
     for i in 0..POINT {
         point_point[(i, i)] *= 1.0 + at.damping;
     }
-    let cov = point_point.cholesky()?.inverse();
+    let cov = inverse(&point_point)?;
     let crosses = first_cross..system.crosses.len();
     for i in crosses.clone() {
         let a = &system.crosses[i];

@@ -1,10 +1,12 @@
 //! The window against simulated points: what it says of its own error must hold.
 
 use super::super::{Settings, StereoMeasurement};
+use super::memory::UnknownsBySources;
+use super::system::At;
 use super::*;
 use crate::simulation::{self, points};
 use crate::uncertainty::consistency;
-use nalgebra::{Vector2, Vector3, Vector4, Vector6};
+use nalgebra::{DVector, Vector2, Vector3, Vector4, Vector6};
 use rand::{RngExt, SeedableRng};
 use rand_distr::{Distribution, StandardNormal};
 use rand_xoshiro::Xoshiro256PlusPlus;
@@ -80,10 +82,10 @@ fn step() -> Isometry3<f64> {
 /// Drives along a gentle curve with a right image that is displaced; every frame is a keyframe.
 fn drive(steps: usize, survival: f64, displaced_px: f64, settings: &Settings, seed: u64) -> Run {
     let mut relief = Relief::new(0.0, false, seed);
-    drive_over(steps, survival, displaced_px, &mut relief, settings, seed)
+    drive_over(steps, survival, displaced_px, &mut relief, settings, seed).0
 }
 
-/// The same where landmarks are off in a way of their own.
+/// The same where landmarks are off in a way of their own; and the window at its end.
 fn drive_over(
     steps: usize,
     survival: f64,
@@ -91,7 +93,7 @@ fn drive_over(
     relief: &mut Relief,
     settings: &Settings,
     seed: u64,
-) -> Run {
+) -> (Run, Window) {
     let rig = simulation::thesis_rig();
     let world = points::Settings {
         landmarks: 80,
@@ -141,7 +143,7 @@ fn drive_over(
     run.warp_px = -window.warp_px()[0];
     run.sigma_warp_px = window.sigma_warp_px()[0];
     run.dispersion = window.dispersion.smoothed();
-    run
+    (run, window)
 }
 
 fn exact() -> Settings {
@@ -204,7 +206,7 @@ fn what_stays_with_a_landmark_does_not_average_out() {
     let drive_by = |is_stated| {
         let runs = (0..RUNS).map(|seed| {
             let mut relief = Relief::new(0.3, is_stated, seed);
-            drive_over(10, 0.9, 0.0, &mut relief, &settings, seed)
+            drive_over(10, 0.9, 0.0, &mut relief, &settings, seed).0
         });
         let runs: Vec<Run> = runs.collect();
         (anees(&runs), dispersion(&runs))
@@ -255,6 +257,47 @@ fn nothing_is_lost_of_precision_over_many_keyframes() {
     let late = late.iter().sum::<f64>() / (6 * late.len()) as f64;
     assert!((0.85..1.15).contains(&motion), "{motion}");
     assert!((0.75..1.25).contains(&late), "{late}");
+}
+
+/// All that a window says of its unknowns where they stand: information, right side, and by how much that moves
+/// with each source of error.
+fn said(window: &Window) -> (DMatrix<f64>, DVector<f64>, UnknownsBySources) {
+    let (mut system, mut memory) = (System::default(), Memory::default());
+    let (hessian, gradient, _) = window.equations(&mut system, &mut memory, 0.0);
+    let at = At::new(
+        &window.rig,
+        &window.warp,
+        &window.frames,
+        window.variance.smoothed,
+    );
+    let by_sources =
+        Sensitivity::with_room(0).right_side(&at, &window.errors, &system, &window.landmarks);
+    (hessian, gradient, by_sources + window.prior.by_sources)
+}
+
+#[test]
+fn what_is_retired_says_the_same_of_the_poses() {
+    let mut relief = Relief::new(0.0, false, 5);
+    let (_, mut window) = drive_over(40, 0.97, 0.1, &mut relief, &Settings::default(), 5);
+    // A third of the landmarks has been out of view for a while.
+    let recent: Vec<u64> = window.keyframe_serials().skip(11).collect();
+    let old = window.landmarks.iter_mut().filter(|l| l.anchor < recent[0]);
+    for landmark in old.step_by(3) {
+        for serial in &recent {
+            landmark.forget(*serial);
+        }
+    }
+    let landmarks = window.landmarks.len();
+    let (hessian, gradient, by_sources) = said(&window);
+    window.retire_landmarks();
+    assert!(window.landmarks.len() + 10 < landmarks, "{landmarks}");
+    let (hessian_after, gradient_after, by_sources_after) = said(&window);
+    let gap = (hessian_after - &hessian).norm() / hessian.norm();
+    assert!(gap < 1e-12, "{gap}");
+    let gap = (gradient_after - &gradient).norm() / gradient.norm();
+    assert!(gap < 1e-6, "{gap} of {}", gradient.norm());
+    let gap = (by_sources_after - by_sources).norm() / by_sources.norm();
+    assert!(gap < 1e-9, "{gap}");
 }
 
 #[test]
