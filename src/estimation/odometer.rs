@@ -208,12 +208,13 @@ impl Odometer {
         measured: &MeasuredMotion,
         counts: Counts,
     ) -> Odometry {
-        let parts = self
+        let cov_right = self
             .errors
-            .apart(&measured.estimate.cov_right, &measured.by_sources);
+            .apart(&measured.estimate.cov_right, &measured.by_sources)
+            .total();
         let since_last = self.since_last_row(&MotionEstimate {
             prev_from_now: measured.estimate.prev_from_now,
-            cov_right: parts.total(),
+            cov_right,
         });
         let dt_s = seconds_between(self.last.timestamp_ns, stamp.timestamp_ns);
         self.velocity = velocity_of(&since_last, dt_s, self.sigma_stamp_s());
@@ -229,7 +230,7 @@ impl Odometer {
         self.last = now;
         self.reference_from_last = no_motion();
         let is_flat = measured.departure.is_none_or(|d| d <= FLAT_LIMIT);
-        let is_determined = Axes::left_open_by(&parts.total()).is_empty();
+        let is_determined = Axes::left_open_by(&cov_right).is_empty();
         let is_plausible = is_flat && is_possible && is_determined;
         let status = self
             .standing

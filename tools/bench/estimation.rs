@@ -14,7 +14,7 @@ use visod::pipeline::{DescribedPair, Method};
 use visod::simulation::thesis_rig;
 
 /// Landmarks to follow so that a pair sees about 500 of them.
-const MANY_LANDMARKS: u32 = 570;
+const MANY_LANDMARKS: u32 = 530;
 
 /// Pairs that are stepped through.
 const PAIRS: u64 = 200;
