@@ -45,9 +45,7 @@ pub type BySources = SMatrix<f64, 6, SOURCES>;
 /// How a rig may be wrong.
 #[derive(Clone, Debug, PartialEq)]
 pub struct RigErrors {
-    /// Parameters by modes.
-    root: SMatrix<f64, RIG_PARAMETERS, MODES>,
-    /// The same, transposed.
+    /// The modes, a row each, by the parameters.
     modes_by_parameters: SMatrix<f64, MODES, RIG_PARAMETERS>,
     /// Whether the warp's prior is an error of its own rather than another form of the modes.
     warp_counts: bool,
@@ -74,7 +72,6 @@ impl RigErrors {
             warp_counts: stated.is_none() || !settings.consider_calibration,
             skew_counts: settings.consider_synchronisation,
             modes_by_parameters: root.transpose(),
-            root,
         }
     }
 
@@ -129,7 +126,7 @@ impl RigErrors {
         &self,
         by_rig: &SMatrix<f64, 6, RIG_PARAMETERS>,
     ) -> SMatrix<f64, 6, MODES> {
-        by_rig * self.root
+        product_transposed(by_rig, &self.modes_by_parameters)
     }
 
     /// A covariance by source. `cov` is that of the estimate, the warp's prior included; `by` what
@@ -316,7 +313,8 @@ mod tests {
         let rig = stated();
         let errors = RigErrors::of(&rig, &Settings::default());
         let covariance = rig.covariance().expect("stated");
-        let gap = errors.root * errors.root.transpose() - covariance;
+        let modes = &errors.modes_by_parameters;
+        let gap = modes.transpose() * modes - covariance;
         for i in 0..RIG_PARAMETERS {
             let scale = covariance[(i, i)].max(1e-30);
             assert!(gap[(i, i)].abs() < 1e-9 * scale.max(1e-12), "{i}");

@@ -18,11 +18,11 @@ pub(super) type UnknownsBySources = SMatrix<f64, MAX_UNKNOWNS, SOURCES>;
 #[derive(Clone, Debug, Default)]
 pub(super) struct Memory(Vec<Vec<f64>>);
 
-/// How many are in use at once at most.
+/// More than an adjustment or a marginalisation uses at once.
 const STOCK: usize = 10;
 
 impl Memory {
-    /// As many as are ever needed at once, so that none has to be made on the way.
+    /// With matrices enough that none has to be made on the way.
     pub(super) fn stocked() -> Self {
         Self((0..STOCK).map(|_| room()).collect())
     }

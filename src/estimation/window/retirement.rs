@@ -4,7 +4,7 @@
 //! To first order nothing is lost: where the prior knows a pose, that is linearised for good anyway. What
 //! no longer follows the poses is the landmark's own place, which nothing new would have moved.
 
-use super::{Landmark, Window};
+use super::{Frame, Landmark, Window};
 
 /// A landmark that none of the last so many keyframes saw will not be found again: those who look for it have
 /// given it up by then.
@@ -17,7 +17,7 @@ impl Window {
         let Some(recent) = self.frames.len().checked_sub(UNSEEN_KEYFRAMES) else {
             return;
         };
-        let is_known = |frame: &&super::Frame| frame.linearised.is_some();
+        let is_known = |frame: &&Frame| frame.linearised.is_some();
         let known = self.frames.iter().skip(1).take_while(is_known).count();
         let first_kept = self.frames[recent.min(known + 1)].serial;
         let is_retired = |l: &Landmark| l.last_seen() < first_kept;
@@ -41,10 +41,14 @@ impl Window {
             let is_retired = is_retired(landmark);
             if is_retired {
                 let sights = std::mem::take(&mut landmark.observations);
-                for frame in frames.iter_mut() {
-                    let saw_it =
-                        sights.len() > 1 && sights.iter().any(|o| o.serial == frame.serial);
-                    frame.retired_sights += u32::from(saw_it);
+                // One alone says nothing of poses.
+                if sights.len() > 1 {
+                    for sight in &sights {
+                        let frame = frames.iter_mut().find(|f| f.serial == sight.serial);
+                        if let Some(frame) = frame {
+                            frame.retired_sights += 1;
+                        }
+                    }
                 }
                 spare.push(sights);
             }

@@ -199,7 +199,11 @@ fn displacement<const ROWS: usize>(
     from: &Isometry3<f64>,
     y: &Vector3<f64>,
 ) -> Option<SMatrix<f64, ROWS, 4>> {
-    let mut by = errors.displacement::<ROWS>(at.rig, from, y)?;
+    let mut by = if errors.has_modes() {
+        errors.displacement::<ROWS>(at.rig, from, y)?
+    } else {
+        SMatrix::zeros()
+    };
     let exposure = &at.frames[frame].exposure;
     if exposure.sigma_skew_s > 0.0 {
         let skew = sight_by_skew(at.rig, from, y, &exposure.twist)? * exposure.sigma_skew_s;
