@@ -7,41 +7,48 @@
 
 use super::bundle::TrackedPoint;
 use super::influence::Influence;
-use super::sight;
+use super::sight::{Sight, Viewpoint};
 use crate::geometry::rig_parameters::{
     CAMERA_PARAMETERS, EXTRINSICS, RIG_PARAMETERS, pixel_by_parameters,
 };
-use crate::geometry::{Camera, StereoRig, product::product, so3};
+use crate::geometry::{StereoRig, product::product, so3};
 use crate::uncertainty::consider::Sensitivity;
-use nalgebra::{Isometry3, Matrix2x3, Point3, SMatrix, Vector2, Vector3, Vector4, Vector6};
+use nalgebra::{Isometry3, SMatrix, Vector3, Vector4, Vector6};
 
-/// By how much the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from a rig moved by
-/// `now_from_prev` moves with each parameter of the rig, the point and the motion staying.
+/// By how much the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from where a rig has gone
+/// moves with each parameter of the rig, the point and the motion staying.
 ///
 /// `None` where a camera cannot see the point.
 #[must_use]
 pub fn sight_by_rig(
     rig: &StereoRig,
-    now_from_prev: &Isometry3<f64>,
+    from: &Viewpoint,
     y: &Vector3<f64>,
 ) -> Option<SMatrix<f64, 4, RIG_PARAMETERS>> {
-    let left = now_from_prev.rotation * Vector3::new(y.x, y.y, 1.0)
-        + now_from_prev.translation.vector * y.z;
-    let turned = rig.right_from_left.rotation * left;
-    let right = turned + rig.right_from_left.translation.vector * y.z;
-    let (left_by_camera, _) = by_camera(&rig.left, &left)?;
-    let (right_by_camera, right_by_point) = by_camera(&rig.right, &right)?;
+    Some(seen_by_rig(rig, from, y, &from.linearise(rig, y)?))
+}
+
+/// [`sight_by_rig`] of a sight that has been linearised.
+#[must_use]
+pub fn seen_by_rig(
+    rig: &StereoRig,
+    from: &Viewpoint,
+    y: &Vector3<f64>,
+    seen: &Sight,
+) -> SMatrix<f64, 4, RIG_PARAMETERS> {
+    let [left, right] = from.of_cameras(y);
+    let turned = right - rig.right_from_left.translation.vector * y.z;
     let mut by = SMatrix::<f64, 4, RIG_PARAMETERS>::zeros();
     by.fixed_view_mut::<2, CAMERA_PARAMETERS>(0, 0)
-        .copy_from(&left_by_camera);
+        .copy_from(&pixel_by_parameters(&rig.left, &(left.xy() / left.z)));
     by.fixed_view_mut::<2, CAMERA_PARAMETERS>(2, CAMERA_PARAMETERS)
-        .copy_from(&right_by_camera);
+        .copy_from(&pixel_by_parameters(&rig.right, &(right.xy() / right.z)));
     by.fixed_view_mut::<2, 3>(2, EXTRINSICS)
-        .copy_from(&(right_by_point * y.z));
+        .copy_from(&(seen.right_by_ray * y.z));
     // exp(r) turns the point before the baseline is added.
     by.fixed_view_mut::<2, 3>(2, EXTRINSICS + 3)
-        .copy_from(&(right_by_point * -so3::hat(&turned)));
-    Some(by)
+        .copy_from(&product(&seen.right_by_ray, &-so3::hat(&turned)));
+    by
 }
 
 /// By how much the same sight moves, px/s, with the time by which the right image is exposed after
@@ -51,24 +58,20 @@ pub fn sight_by_rig(
 #[must_use]
 pub fn sight_by_skew(
     rig: &StereoRig,
-    now_from_prev: &Isometry3<f64>,
+    from: &Viewpoint,
     y: &Vector3<f64>,
     twist: &Vector6<f64>,
 ) -> Option<Vector4<f64>> {
-    let seen = sight::linearise(rig, now_from_prev, y)?;
+    Some(seen_by_skew(&from.linearise(rig, y)?, twist))
+}
+
+/// [`sight_by_skew`] of a sight that has been linearised.
+#[must_use]
+pub fn seen_by_skew(seen: &Sight, twist: &Vector6<f64>) -> Vector4<f64> {
     let mut by = product(&seen.by_motion, twist);
     by[0] = 0.0;
     by[1] = 0.0;
-    Some(by)
-}
-
-fn by_camera(
-    camera: &Camera,
-    point: &Vector3<f64>,
-) -> Option<(SMatrix<f64, 2, CAMERA_PARAMETERS>, Matrix2x3<f64>)> {
-    let (_, by_point) = camera.project_with_jacobian(&Point3::from(*point))?;
-    let normalised = Vector2::new(point.x / point.z, point.y / point.z);
-    Some((pixel_by_parameters(camera, &normalised), by_point))
+    by
 }
 
 /// The derivative of a motion by the rig's parameters, and by the skew of its exposures, s.
@@ -103,16 +106,16 @@ pub fn of_motion<'a>(
     twist_prev: &Vector6<f64>,
     twist_now: &Vector6<f64>,
 ) -> Option<MotionSensitivity> {
-    let identity = Isometry3::identity();
-    let now_from_prev = prev_from_now.inverse();
+    let before = Viewpoint::unmoved(rig);
+    let now = Viewpoint::new(rig, &prev_from_now.inverse());
     let mut by_rig = SMatrix::<f64, 6, RIG_PARAMETERS>::zeros();
     let mut by_skew = Vector6::zeros();
     for (point, influence) in tracks {
         let y = &point.inverse_depth;
-        by_rig += product(&influence.by_prev, &sight_by_rig(rig, &identity, y)?);
-        by_rig += product(&influence.by_now, &sight_by_rig(rig, &now_from_prev, y)?);
-        by_skew += influence.by_prev * sight_by_skew(rig, &identity, y, twist_prev)?;
-        by_skew += influence.by_now * sight_by_skew(rig, &now_from_prev, y, twist_now)?;
+        by_rig += product(&influence.by_prev, &sight_by_rig(rig, &before, y)?);
+        by_rig += product(&influence.by_now, &sight_by_rig(rig, &now, y)?);
+        by_skew += influence.by_prev * sight_by_skew(rig, &before, y, twist_prev)?;
+        by_skew += influence.by_now * sight_by_skew(rig, &now, y, twist_now)?;
     }
     Some(MotionSensitivity {
         by_rig: Sensitivity::new(by_rig),
@@ -233,7 +236,7 @@ mod tests {
             let rig = rig();
             let now_from_prev = se3::exp(&Vector6::from(xi));
             let y = Vector3::new(x, v, rho);
-            let exact = sight_by_rig(&rig, &now_from_prev, &y).expect("in front");
+            let exact = sight_by_rig(&rig, &Viewpoint::new(&rig, &now_from_prev), &y).expect("in front");
             for j in 0..RIG_PARAMETERS {
                 // Pixels hardly notice 1e-4 of a focal length, and much of a coefficient.
                 let step = if j < EXTRINSICS && j % CAMERA_PARAMETERS < 4 { 1e-2 } else { 1e-5 };
@@ -256,7 +259,8 @@ mod tests {
             let rig = rig();
             let prev_from_now = se3::exp(&Vector6::new(0.1, 0.0, 0.2, 0.0, 0.05, 0.0));
             let (y, twist) = (Vector3::new(x, v, rho), Vector6::from(twist));
-            let exact = sight_by_skew(&rig, &prev_from_now.inverse(), &y, &twist).expect("in front");
+            let from = Viewpoint::new(&rig, &prev_from_now.inverse());
+            let exact = sight_by_skew(&rig, &from, &y, &twist).expect("in front");
             let h = 1e-5;
             let at = |dt: f64| {
                 let later = prev_from_now * se3::exp(&(twist * dt));

@@ -6,7 +6,8 @@
 //! error's distribution and spoil the covariance).
 
 use super::bundle::TrackedPoint;
-use super::{StereoMeasurement, closed_form, sight};
+use super::sight::Viewpoint;
+use super::{StereoMeasurement, closed_form};
 use crate::geometry::definite;
 use crate::geometry::product::{product, product_transposed, transposed_product};
 use crate::geometry::{StereoRig, se3};
@@ -71,8 +72,8 @@ impl Sighting {
     /// does not determine it.
     #[must_use]
     pub fn of(rig: &StereoRig, p: &TrackedPoint) -> Option<Self> {
-        let identity = Isometry3::identity();
-        let by_point = sight::linearise(rig, &identity, &p.inverse_depth)?.by_point;
+        let before = Viewpoint::unmoved(rig);
+        let by_point = before.linearise(rig, &p.inverse_depth)?.by_point;
         let info = Matrix4::from_diagonal(&p.prev.sigma_px.map(|s| 1.0 / (s * s)));
         Some(Self {
             inverse_depth: p.inverse_depth,
@@ -151,15 +152,17 @@ pub fn find_in(
     } = room;
     inliers.clear();
     candidates.clear();
-    candidates.extend(points.iter().map(|p| Candidate::new(rig, p, guess)));
+    let there = guess.map_or_else(Isometry3::identity, Isometry3::inverse);
+    let there = Viewpoint::new(rig, &there);
+    candidates.extend(points.iter().map(|p| Candidate::new(rig, p, &there)));
     samplable.clear();
     samplable.extend((0..candidates.len()).filter(|&i| candidates[i].has_depth()));
     let gate = search.gate * search.variance_factor;
     let motion = best_motion(rig, candidates, samplable, guess, gate, search)?;
-    let now_from_prev = motion.inverse();
+    let now = Viewpoint::new(rig, &motion.inverse());
     inliers.extend(
         (0..candidates.len() as u32)
-            .filter(|&i| candidates[i as usize].squared_sigmas(rig, &now_from_prev) <= gate),
+            .filter(|&i| candidates[i as usize].squared_sigmas(rig, &now) <= gate),
     );
     (inliers.len() >= 3).then_some(motion)
 }
@@ -224,9 +227,8 @@ struct Candidate {
 }
 
 impl Candidate {
-    fn new(rig: &StereoRig, p: &Sighting, guess: Option<&Isometry3<f64>>) -> Self {
-        let now_from_prev = guess.map_or_else(Isometry3::identity, Isometry3::inverse);
-        let info = Self::predicted_info(rig, p, &now_from_prev).unwrap_or_else(|| {
+    fn new(rig: &StereoRig, p: &Sighting, there: &Viewpoint) -> Self {
+        let info = Self::predicted_info(rig, p, there).unwrap_or_else(|| {
             let var = p.now.sigma_px.component_mul(&p.now.sigma_px) * 4.0;
             Matrix4::from_diagonal(&var.map(|v| 1.0 / v))
         });
@@ -255,12 +257,8 @@ impl Candidate {
 
     /// Residual now = its own noise, what the uncertainty of the point carries over, and the lasting error of
     /// the right camera, as far as the point has not taken it up.
-    fn predicted_info(
-        rig: &StereoRig,
-        p: &Sighting,
-        now_from_prev: &Isometry3<f64>,
-    ) -> Option<Matrix4<f64>> {
-        let by_point = sight::linearise(rig, now_from_prev, &p.inverse_depth)?.by_point;
+    fn predicted_info(rig: &StereoRig, p: &Sighting, there: &Viewpoint) -> Option<Matrix4<f64>> {
+        let by_point = there.linearise(rig, &p.inverse_depth)?.by_point;
         let carried = product_transposed(&product(&by_point, &p.cov), &by_point);
         let mut cov = p.now.cov_px2() + carried;
         if p.is_displaced() {
@@ -272,8 +270,8 @@ impl Candidate {
     }
 
     /// Squared Mahalanobis distance of the present measurement from what a motion predicts.
-    fn squared_sigmas(&self, rig: &StereoRig, now_from_prev: &Isometry3<f64>) -> f64 {
-        let Some(seen) = sight::seen_at(rig, now_from_prev, &self.inverse_depth) else {
+    fn squared_sigmas(&self, rig: &StereoRig, now: &Viewpoint) -> f64 {
+        let Some(seen) = now.seen_at(rig, &self.inverse_depth) else {
             return f64::INFINITY;
         };
         let e = self.now.px - seen;
@@ -318,10 +316,10 @@ fn refine_on_agreeing(
     motion: &Isometry3<f64>,
     gate: f64,
 ) -> Option<Isometry3<f64>> {
-    let now_from_prev = motion.inverse();
+    let now = Viewpoint::new(rig, &motion.inverse());
     let agreeing = candidates
         .iter()
-        .filter(|c| c.squared_sigmas(rig, &now_from_prev) <= gate);
+        .filter(|c| c.squared_sigmas(rig, &now) <= gate);
     if agreeing.clone().count() < 3 {
         return None;
     }
@@ -334,11 +332,11 @@ fn step<'a>(
     candidates: impl Iterator<Item = &'a Candidate>,
     prev_from_now: &Isometry3<f64>,
 ) -> Option<Vector6<f64>> {
-    let now_from_prev = prev_from_now.inverse();
+    let now = Viewpoint::new(rig, &prev_from_now.inverse());
     let mut hessian = Matrix6::zeros();
     let mut gradient = Vector6::zeros();
     for c in candidates {
-        let Some(seen) = sight::linearise(rig, &now_from_prev, &c.inverse_depth) else {
+        let Some(seen) = now.linearise(rig, &c.inverse_depth) else {
             continue;
         };
         let weighted = transposed_product(&seen.by_motion, &c.info);
@@ -365,13 +363,13 @@ impl Best {
         motion: &Isometry3<f64>,
         gate: f64,
     ) {
-        let now_from_prev = motion.inverse();
+        let now = Viewpoint::new(rig, &motion.inverse());
         let mut score = 0.0;
         let mut agreeing = 0.0;
         let mut ahead: f64 = candidates.iter().map(|c| c.weight).sum();
         for c in candidates {
             ahead -= c.weight;
-            let gain = gate - c.squared_sigmas(rig, &now_from_prev);
+            let gain = gate - c.squared_sigmas(rig, &now);
             if gain > 0.0 {
                 score += c.weight * gain / gate;
                 agreeing += 1.0;
@@ -431,10 +429,9 @@ mod tests {
     }
 
     fn mean_squared_sigmas(sightings: &[Sighting]) -> f64 {
-        let (rig, motion) = (rig(), step());
-        let of = |s: &Sighting| {
-            Candidate::new(&rig, s, Some(&motion)).squared_sigmas(&rig, &motion.inverse())
-        };
+        let rig = rig();
+        let now = Viewpoint::new(&rig, &step().inverse());
+        let of = |s: &Sighting| Candidate::new(&rig, s, &now).squared_sigmas(&rig, &now);
         sightings.iter().map(of).sum::<f64>() / sightings.len() as f64
     }
 

@@ -31,7 +31,7 @@ pub use model::{FLAT_LIMIT, Model, MotionModel, Plane};
 pub use motion::{MeasuredMotion, MotionMeter, Tracks as MotionTracks};
 pub use odometer::{Odometer, PairStamp, Place};
 pub use settings::{KEYFRAMES, Method, Settings};
-pub use sight::{Sight, inverse_depth, linearise as linearise_sight, seen_at};
+pub use sight::{Sight, Viewpoint, inverse_depth, linearise as linearise_sight, seen_at};
 pub use start::Start;
 pub use tracked_feature::TrackedFeature;
 pub use triangulation::{Landmark, StereoMeasurement, triangulate, triangulate_linear};

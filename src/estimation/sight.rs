@@ -8,7 +8,7 @@
 use super::StereoMeasurement;
 use crate::geometry::product::{product, transposed_scaled};
 use crate::geometry::{StereoRig, so3};
-use nalgebra::{Isometry3, Matrix3, Matrix4x3, Point3, SMatrix, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix2x3, Matrix3, Matrix4x3, Point3, SMatrix, Vector3, Vector4};
 
 /// A sight, linearised.
 #[derive(Clone, Copy, Debug)]
@@ -19,6 +19,116 @@ pub struct Sight {
     pub by_point: Matrix4x3<f64>,
     /// By a right perturbation of `prev_from_now` (translation, rotation).
     pub by_motion: SMatrix<f64, 4, 6>,
+    /// By the point times ρ in the right camera, of what that sees.
+    pub(super) right_by_ray: Matrix2x3<f64>,
+}
+
+/// Where a rig has gone: made once, then asked for many points.
+#[derive(Clone, Copy, Debug)]
+pub struct Viewpoint {
+    left: Camerawards,
+    right: Camerawards,
+    right_from_left: Matrix3<f64>,
+}
+
+/// A point times ρ, in the frame of a camera: affine in (x, y, ρ).
+#[derive(Clone, Copy, Debug)]
+struct Camerawards {
+    by_point: Matrix3<f64>,
+    /// Where (0, 0, 0) comes out, straight ahead and infinitely far.
+    ahead: Vector3<f64>,
+}
+
+impl Camerawards {
+    #[inline(always)]
+    fn take(&self, y: &Vector3<f64>) -> Vector3<f64> {
+        product(&self.by_point, y) + self.ahead
+    }
+}
+
+impl Viewpoint {
+    /// That of a rig that was moved: `now_from_prev` maps a point of the left camera where points are
+    /// given in into the left camera where the rig is.
+    #[must_use]
+    pub fn new(rig: &StereoRig, now_from_prev: &Isometry3<f64>) -> Self {
+        let rotation = now_from_prev.rotation.to_rotation_matrix();
+        let right_from_left = rig.right_from_left.rotation.to_rotation_matrix();
+        let left = Camerawards {
+            by_point: Matrix3::from_columns(&[
+                rotation.matrix().column(0).into_owned(),
+                rotation.matrix().column(1).into_owned(),
+                now_from_prev.translation.vector,
+            ]),
+            ahead: rotation.matrix().column(2).into_owned(),
+        };
+        let mut right = Camerawards {
+            by_point: right_from_left * left.by_point,
+            ahead: right_from_left * left.ahead,
+        };
+        let mut by_inverse_depth = right.by_point.column_mut(2);
+        by_inverse_depth += rig.right_from_left.translation.vector;
+        Self {
+            left,
+            right,
+            right_from_left: *right_from_left.matrix(),
+        }
+    }
+
+    /// That of a rig that has not moved.
+    #[must_use]
+    pub fn unmoved(rig: &StereoRig) -> Self {
+        Self::new(rig, &Isometry3::identity())
+    }
+
+    /// The point times ρ, in the left camera and in the right one.
+    #[inline]
+    pub(super) fn of_cameras(&self, y: &Vector3<f64>) -> [Vector3<f64>; 2] {
+        [self.left.take(y), self.right.take(y)]
+    }
+
+    /// Where `rig` sees the point `y` = (x, y, ρ) from there: (ul, vl, ur, vr), px. `None` where a
+    /// camera cannot.
+    #[must_use]
+    #[inline]
+    pub fn seen_at(&self, rig: &StereoRig, y: &Vector3<f64>) -> Option<Vector4<f64>> {
+        let [left, right] = self.of_cameras(y);
+        let l = rig.left.project(&Point3::from(left))?;
+        let r = rig.right.project(&Point3::from(right))?;
+        Some(Vector4::new(l.x, l.y, r.x, r.y))
+    }
+
+    /// [`seen_at`](Self::seen_at) with its derivatives.
+    #[must_use]
+    #[inline(always)]
+    pub fn linearise(&self, rig: &StereoRig, y: &Vector3<f64>) -> Option<Sight> {
+        let [left, right] = self.of_cameras(y);
+        let (l_px, l_by) = rig.left.project_with_jacobian(&Point3::from(left))?;
+        let (r_px, r_by) = rig.right.project_with_jacobian(&Point3::from(right))?;
+        let l_by_point = product(&l_by, &self.left.by_point);
+        let r_by_point = product(&r_by, &self.right.by_point);
+        // The point now is Exp(−ξ) applied to it: −ρ · translation + [left]× · rotation.
+        let turned = so3::hat(&left);
+        let r_by_left = product(&r_by, &self.right_from_left);
+        let (l_by_turn, r_by_turn) = (product(&l_by, &turned), product(&r_by_left, &turned));
+        let mut by_point = Matrix4x3::zeros();
+        let mut by_motion = SMatrix::<f64, 4, 6>::zeros();
+        for axis in 0..3 {
+            for row in 0..2 {
+                by_point[(row, axis)] = l_by_point[(row, axis)];
+                by_point[(2 + row, axis)] = r_by_point[(row, axis)];
+                by_motion[(row, axis)] = l_by[(row, axis)] * -y.z;
+                by_motion[(2 + row, axis)] = r_by_left[(row, axis)] * -y.z;
+                by_motion[(row, 3 + axis)] = l_by_turn[(row, axis)];
+                by_motion[(2 + row, 3 + axis)] = r_by_turn[(row, axis)];
+            }
+        }
+        Some(Sight {
+            px: Vector4::new(l_px.x, l_px.y, r_px.x, r_px.y),
+            by_point,
+            by_motion,
+            right_by_ray: r_by,
+        })
+    }
 }
 
 /// Where the rig, moved by `now_from_prev`, sees the point `y` = (x, y, ρ): (ul, vl, ur, vr), px.
@@ -29,12 +139,7 @@ pub fn seen_at(
     now_from_prev: &Isometry3<f64>,
     y: &Vector3<f64>,
 ) -> Option<Vector4<f64>> {
-    let left = now_from_prev.rotation * Vector3::new(y.x, y.y, 1.0)
-        + now_from_prev.translation.vector * y.z;
-    let right = rig.right_from_left.rotation * left + rig.right_from_left.translation.vector * y.z;
-    let l = rig.left.project(&Point3::from(left))?;
-    let r = rig.right.project(&Point3::from(right))?;
-    Some(Vector4::new(l.x, l.y, r.x, r.y))
+    Viewpoint::new(rig, now_from_prev).seen_at(rig, y)
 }
 
 /// [`seen_at`] with its derivatives.
@@ -44,50 +149,7 @@ pub fn linearise(
     now_from_prev: &Isometry3<f64>,
     y: &Vector3<f64>,
 ) -> Option<Sight> {
-    let rotation = now_from_prev.rotation.to_rotation_matrix();
-    let r = rotation.matrix();
-    let t = now_from_prev.translation.vector;
-    let left = r * Vector3::new(y.x, y.y, 1.0) + t * y.z;
-    let right_rotation = rig.right_from_left.rotation.to_rotation_matrix();
-    let baseline = rig.right_from_left.translation.vector;
-    let right = right_rotation * left + baseline * y.z;
-    let (l_px, l_by) = rig.left.project_with_jacobian(&Point3::from(left))?;
-    let (r_px, r_by) = rig.right.project_with_jacobian(&Point3::from(right))?;
-    let r_by_left = product(&r_by, right_rotation.matrix());
-
-    let left_by_point =
-        Matrix3::from_columns(&[r.column(0).into_owned(), r.column(1).into_owned(), t]);
-    let mut by_point = Matrix4x3::zeros();
-    by_point
-        .fixed_view_mut::<2, 3>(0, 0)
-        .copy_from(&product(&l_by, &left_by_point));
-    let mut right_by_point = product(&r_by_left, &left_by_point);
-    let mut by_inverse_depth = right_by_point.column_mut(2);
-    by_inverse_depth += product(&r_by, &baseline);
-    by_point
-        .fixed_view_mut::<2, 3>(2, 0)
-        .copy_from(&right_by_point);
-
-    // The point now is Exp(−ξ) applied to it: −ρ · translation + [left]× · rotation.
-    let turned = so3::hat(&left);
-    let mut by_motion = SMatrix::<f64, 4, 6>::zeros();
-    by_motion
-        .fixed_view_mut::<2, 3>(0, 0)
-        .copy_from(&(l_by * -y.z));
-    by_motion
-        .fixed_view_mut::<2, 3>(0, 3)
-        .copy_from(&product(&l_by, &turned));
-    by_motion
-        .fixed_view_mut::<2, 3>(2, 0)
-        .copy_from(&(r_by_left * -y.z));
-    by_motion
-        .fixed_view_mut::<2, 3>(2, 3)
-        .copy_from(&product(&r_by_left, &turned));
-    Some(Sight {
-        px: Vector4::new(l_px.x, l_px.y, r_px.x, r_px.y),
-        by_point,
-        by_motion,
-    })
+    Viewpoint::new(rig, now_from_prev).linearise(rig, y)
 }
 
 /// Gauss–Newton steps of [`inverse_depth`]; it converges in two or three.
@@ -99,11 +161,11 @@ const MAX_STEPS: usize = 8;
 /// `None` where the sights do not meet in front of the cameras or a pixel has no ray.
 #[must_use]
 pub fn inverse_depth(rig: &StereoRig, measurement: &StereoMeasurement) -> Option<Vector3<f64>> {
-    let identity = Isometry3::identity();
+    let here = Viewpoint::unmoved(rig);
     let mut y = starting_point(rig, measurement)?;
     let info = measurement.sigma_px.map(|s| 1.0 / (s * s));
     for _ in 0..MAX_STEPS {
-        let seen = linearise(rig, &identity, &y)?;
+        let seen = here.linearise(rig, &y)?;
         let weighted = transposed_scaled(&seen.by_point, &info);
         let step = product(&weighted, &seen.by_point)
             .cholesky()?

@@ -19,7 +19,8 @@
 //! together.
 
 use super::Settings;
-use super::calibration::sight_by_rig;
+use super::calibration::{seen_by_rig, sight_by_rig};
+use super::sight::{Sight, Viewpoint};
 use super::window::WARP;
 use crate::geometry::product::product_transposed;
 use crate::geometry::rig_parameters::{
@@ -87,18 +88,18 @@ impl RigErrors {
         self.modes
     }
 
-    /// By how much the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from a rig moved by
-    /// `now_from_prev` is displaced by 1 σ of each mode, a row each, as many as there are `ROWS`. `None` where a
-    /// camera cannot see the point.
+    /// By how much `seen`, the sight (ul, vl, ur, vr), px, of the point `y` = (x, y, ρ) from where a rig
+    /// has gone, is displaced by 1 σ of each mode, a row each, as many as there are `ROWS`.
     #[must_use]
     #[inline(always)]
     pub fn displacement<const ROWS: usize>(
         &self,
         rig: &StereoRig,
-        now_from_prev: &Isometry3<f64>,
+        from: &Viewpoint,
         y: &Vector3<f64>,
-    ) -> Option<SMatrix<f64, ROWS, 4>> {
-        let by_rig = sight_by_rig(rig, now_from_prev, y)?;
+        seen: &Sight,
+    ) -> SMatrix<f64, ROWS, 4> {
+        let by_rig = seen_by_rig(rig, from, y, seen);
         // Neither camera's pixels depend on the other's lens, nor the left one's on where the right one is.
         let parameters = [
             0..CAMERA_PARAMETERS,
@@ -111,13 +112,17 @@ impl RigErrors {
             let column = &mut by_modes.data.0[px];
             for k in parameters {
                 let factor = by_rig.data.0[k][px];
+                // Most parameters move one coordinate at most.
+                if factor == 0.0 {
+                    continue;
+                }
                 let modes = &self.modes_by_parameters.data.0[k];
                 for (out, mode) in column.iter_mut().zip(modes) {
                     *out += mode * factor;
                 }
             }
         }
-        Some(by_modes)
+        by_modes
     }
 
     /// The derivative by the modes, of what has this derivative by the rig's parameters.
@@ -214,12 +219,12 @@ fn modes_of(rig: &StereoRig, covariance: &RigCovariance) -> SMatrix<f64, RIG_PAR
     let sigmas: RigVector = eigen.eigenvalues.map(|v| v.max(0.0).sqrt());
     let root = eigen.eigenvectors * RigCovariance::from_diagonal(&sigmas);
     let mut weight = RigCovariance::zeros();
-    let identity = Isometry3::identity();
+    let unmoved = Viewpoint::unmoved(rig);
     let inverse_depth = |disparity_px: f64| disparity_px / (rig.left.focal_px.x * rig.baseline_m());
     for ray in rig.left.spread_rays() {
         for disparity_px in DISPARITIES_PX {
             let y = ray.push(inverse_depth(disparity_px));
-            if let Some(by) = sight_by_rig(rig, &identity, &y) {
+            if let Some(by) = sight_by_rig(rig, &unmoved, &y) {
                 let by = by * root;
                 weight += by.transpose() * by;
             }
@@ -283,7 +288,8 @@ impl Exposure {
         if self.skew_s == 0.0 {
             return Vector4::zeros();
         }
-        super::calibration::sight_by_skew(rig, now_from_prev, y, &self.twist)
+        let from = Viewpoint::new(rig, now_from_prev);
+        super::calibration::sight_by_skew(rig, &from, y, &self.twist)
             .map_or_else(Vector4::zeros, |by| by * self.skew_s)
     }
 }
@@ -356,9 +362,9 @@ mod tests {
             camera.principal_point_px.y,
         );
         let ray = camera.unproject(&border).expect("has a ray");
-        let by = errors
-            .displacement::<MODES>(&rig, &Isometry3::identity(), &ray.push(0.0))
-            .expect("in front");
+        let (from, far) = (Viewpoint::unmoved(&rig), ray.push(0.0));
+        let seen = from.linearise(&rig, &far).expect("in front");
+        let by = errors.displacement::<MODES>(&rig, &from, &far, &seen);
         for mode in 0..3 {
             let moved = by.fixed_view::<1, 2>(mode, 0).norm();
             assert!((moved - sigma_px).abs() < 1e-9, "{mode} {moved}");

@@ -53,6 +53,7 @@ impl Camera {
     ///
     /// `None` behind the camera and where the distortion model folds back.
     #[must_use]
+    #[inline]
     pub fn project(&self, point: &Point3<f64>) -> Option<Vector2<f64>> {
         let normalised = self.normalise(point)?;
         let distorted = self.distortion.distort(&normalised);
@@ -61,6 +62,7 @@ impl Camera {
 
     /// [`project`](Self::project) with the derivative of the pixel by the point, px/m.
     #[must_use]
+    #[inline]
     pub fn project_with_jacobian(
         &self,
         point: &Point3<f64>,
@@ -68,21 +70,15 @@ impl Camera {
         let normalised = self.normalise(point)?;
         let (distorted, by_normalised) = self.distortion.distort_with_jacobian(&normalised);
         let inv_z = 1.0 / point.z;
-        let by_point = Matrix2x3::new(
-            inv_z,
-            0.0,
-            -normalised.x * inv_z,
-            0.0,
-            inv_z,
-            -normalised.y * inv_z,
-        );
-        let mut jacobian = product(&by_normalised, &by_point);
-        for (mut row, focal) in jacobian.row_iter_mut().zip(&self.focal_px) {
-            row *= *focal;
-        }
+        let scale = self.focal_px * inv_z;
+        let by_ray = [
+            by_normalised.column(0).into_owned(),
+            by_normalised.column(1).into_owned(),
+            -product(&by_normalised, &normalised),
+        ];
         Some((
             distorted.component_mul(&self.focal_px) + self.principal_point_px,
-            jacobian,
+            Matrix2x3::from_columns(&by_ray.map(|by| by.component_mul(&scale))),
         ))
     }
 
@@ -135,6 +131,7 @@ impl Camera {
             && pixel.y <= f64::from(self.height) - 1.0 - margin_px
     }
 
+    #[inline]
     fn normalise(&self, point: &Point3<f64>) -> Option<Vector2<f64>> {
         if point.z.is_nan() || point.z < MIN_DEPTH_M {
             return None;

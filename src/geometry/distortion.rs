@@ -20,12 +20,14 @@ const MAX_STEPS: usize = 50;
 impl Distortion {
     /// The distorted position of `p`, without units (pixels over focal length).
     #[must_use]
+    #[inline]
     pub fn distort(&self, p: &Vector2<f64>) -> Vector2<f64> {
         self.distort_with_jacobian(p).0
     }
 
     /// The distorted position of `p` and its derivative by `p`.
     #[must_use]
+    #[inline]
     pub fn distort_with_jacobian(&self, p: &Vector2<f64>) -> (Vector2<f64>, Matrix2<f64>) {
         match self {
             Self::None => (*p, Matrix2::identity()),

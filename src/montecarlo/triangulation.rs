@@ -4,14 +4,12 @@ use super::verdict::{Tally, Verdict};
 use super::world::RigDraw;
 use super::{MonteCarloError, RigError, Settings, for_each_run, rng_of_run};
 use crate::estimation::{
-    Landmark, MotionModel, Plane, StereoMeasurement, calibration, triangulate,
+    Landmark, MotionModel, Plane, StereoMeasurement, Viewpoint, calibration, triangulate,
 };
 use crate::geometry::StereoRig;
 use crate::geometry::rig_parameters::RigCovariance;
 use crate::uncertainty::{consistency, propagate};
-use nalgebra::{
-    Isometry3, Matrix2x3, Matrix3, Matrix4, Matrix6, Point3, Vector2, Vector3, Vector4, Vector6,
-};
+use nalgebra::{Matrix2x3, Matrix3, Matrix4, Matrix6, Point3, Vector2, Vector3, Vector4, Vector6};
 use rand_xoshiro::Xoshiro256PlusPlus;
 
 /// What the triangulation stage found of one point.
@@ -133,7 +131,7 @@ fn of_calibration(
 ) -> Option<Matrix3<f64>> {
     let p = landmark.point;
     let y = Vector3::new(p.x / p.z, p.y / p.z, 1.0 / p.z);
-    let by_rig = calibration::sight_by_rig(rig, &Isometry3::identity(), &y)?;
+    let by_rig = calibration::sight_by_rig(rig, &Viewpoint::unmoved(rig), &y)?;
     let (_, jacobian) = rig.project_with_jacobian(&p)?;
     let info = Matrix4::from_diagonal(&m.sigma_px.map(|s| 1.0 / (s * s)));
     let by_rig = landmark.cov_m2 * jacobian.transpose() * info * by_rig;

@@ -8,10 +8,10 @@ use super::LEAST;
 use super::filter::{Equations, Filter, STATICS, StaticsCovariance, UNKNOWNS};
 use super::turn::row_by_turn;
 use crate::estimation::calibration::sight_by_rig;
-use crate::estimation::{Settings, StereoMeasurement, seen_at};
+use crate::estimation::{Settings, StereoMeasurement, Viewpoint};
 use crate::geometry::rig_parameters::RIG_PARAMETERS;
 use crate::geometry::{Rectification, StereoRig};
-use nalgebra::{Isometry3, Matrix3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4};
+use nalgebra::{Matrix3, RowVector4, SMatrix, SVector, Vector2, Vector3, Vector4};
 
 /// Pairs for which a track lives, so that its own error comes again and again: what pairs say is counted as if only
 /// every tenth were there.
@@ -184,9 +184,9 @@ fn missed(
     rectification: &Rectification,
     y: &Vector3<f64>,
 ) -> Option<(SVector<f64, STATICS>, SMatrix<f64, 1, RIG_PARAMETERS>)> {
-    let identity = Isometry3::identity();
-    let px = seen_at(rig, &identity, y)?;
-    let by_rig = sight_by_rig(rig, &identity, y)?;
+    let from = Viewpoint::unmoved(rig);
+    let px = from.seen_at(rig, y)?;
+    let by_rig = sight_by_rig(rig, &from, y)?;
     let misses = |px: &Vector4<f64>| {
         let right = rectification.right(&px.fixed_rows::<2>(2).into_owned())?;
         Some(right.y - rectification.left(&px.fixed_rows::<2>(0).into_owned())?.y)

@@ -19,19 +19,19 @@
 //! R. M. Bell, D. F. McCaffrey, *Bias reduction in standard errors for linear regression with multi-stage
 //! samples*, Survey Methodology 28, 2002.
 
-use super::super::sight;
+use super::super::sight::Viewpoint;
 use super::landmark::Landmark;
 use super::memory::{ByUnknowns, carried};
 use super::system::{self, At, POINT, weigh};
 use super::warp::WARP;
-use super::{Joint, MAX_FRAMES, row_of};
+use super::{Joint, MAX_FRAMES, line_count, line_index, row_of};
 use crate::geometry::definite::inverse;
 use crate::geometry::product::{
     product, product_transposed, transposed_product, transposed_scaled,
 };
 use crate::geometry::se3;
 use crate::simd::widened;
-use nalgebra::{Isometry3, Matrix6, SMatrix, SVector, Vector2, Vector6};
+use nalgebra::{Matrix6, SMatrix, SVector, Vector2, Vector6};
 
 /// Regions of the image, across and down.
 const REGIONS: [usize; 2] = [4, 3];
@@ -68,7 +68,7 @@ impl Region {
 /// How one frame sees the landmarks of one anchor.
 #[derive(Clone, Debug)]
 struct Sightline {
-    frame_from_anchor: Isometry3<f64>,
+    current: Viewpoint,
     adjoint: Matrix6<f64>,
     /// By how much the frame moves, relative to the anchor, with the newest pose.
     moved: Block,
@@ -89,7 +89,7 @@ pub(super) struct Dispersion {
     smoothed: f64,
     taken: u32,
     regions: Vec<Region>,
-    /// By anchor, then by frame; those that nothing was seen along are not made.
+    /// By [`line_index`]; those that nothing was seen along are not made.
     sightlines: Vec<Option<Sightline>>,
     of_frames: Vec<OfFrame>,
 }
@@ -101,7 +101,7 @@ impl Dispersion {
             smoothed: 1.0,
             taken: 0,
             regions: Vec::with_capacity(REGIONS[0] * REGIONS[1]),
-            sightlines: Vec::with_capacity(frames * frames),
+            sightlines: Vec::with_capacity(line_count(frames)),
             of_frames: Vec::with_capacity(frames),
         }
     }
@@ -141,7 +141,7 @@ impl Dispersion {
         self.regions
             .resize_with(REGIONS[0] * REGIONS[1], Region::nothing);
         self.sightlines.clear();
-        self.sightlines.resize(n * n, None);
+        self.sightlines.resize(line_count(n), None);
         for landmark in landmarks {
             if let Some(last) = landmark.observations.last() {
                 let region = region_of(at, &last.measurement.left_px());
@@ -206,10 +206,9 @@ fn add_in(
         let Some(frame) = position(observation.serial) else {
             continue;
         };
-        let line = dispersion.sightlines[anchor * at.frames.len() + frame]
+        let line = dispersion.sightlines[line_index(anchor, frame)]
             .get_or_insert_with(|| sightline(at, anchor, frame, along));
-        let Some(seen) = sight::linearise(at.rig, &line.frame_from_anchor, &landmark.inverse_depth)
-        else {
+        let Some(seen) = line.current.linearise(at.rig, &landmark.inverse_depth) else {
             continue;
         };
         sights += 1;
@@ -272,7 +271,7 @@ fn sightline(at: &At<'_>, anchor: usize, frame: usize, along: &[Block; MAX_FRAME
     let adjoint = se3::adjoint(&frame_from_anchor);
     Sightline {
         moved: along[frame] - product(&adjoint, &along[anchor]),
-        frame_from_anchor,
+        current: Viewpoint::new(at.rig, &frame_from_anchor),
         adjoint,
     }
 }

@@ -30,6 +30,7 @@ mod solve;
 mod system;
 #[cfg(test)]
 mod tests;
+mod viewpoints;
 mod warp;
 
 pub use landmark::{Landmark, LandmarkId, Observation};
@@ -38,15 +39,17 @@ use super::closed_form::MotionEstimate;
 use super::sources::{BySources, Exposure, RigErrors, SOURCES};
 use super::{Settings, StereoMeasurement};
 use crate::geometry::{StereoRig, se3};
+use crate::uncertainty::consistency;
 use datum::Datum;
 use dispersion::Dispersion;
 use memory::Memory;
-use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4};
+use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4, Vector6};
 use planar::Ground;
 use prior::Prior;
 use sensitivity::Sensitivity;
 use solve::{Sightings, State};
 use system::System;
+use viewpoints::Viewpoints;
 pub(super) use warp::WARP;
 use warp::Warp;
 
@@ -118,6 +121,7 @@ pub struct Window {
     /// Lists of sights that belong to no landmark at present.
     spare_sights: Vec<Vec<Observation>>,
     squares: Vec<f64>,
+    viewpoints: Viewpoints,
 }
 
 /// The a-posteriori variance factor, smoothed over frames.
@@ -184,6 +188,7 @@ impl Window {
             sightings: Sightings::with_room(landmarks),
             spare_sights,
             squares: Vec::with_capacity(frames * landmarks),
+            viewpoints: Viewpoints::with_room(frames),
         }
     }
 
@@ -311,6 +316,20 @@ impl Window {
     }
 }
 
+/// Pairs of a frame and an anchor, which is not later than the frame, among so many frames.
+fn line_count(frames: usize) -> usize {
+    frames * (frames + 1) / 2
+}
+
+/// The place of one of them.
+fn line_index(anchor: usize, frame: usize) -> usize {
+    debug_assert!(
+        anchor <= frame,
+        "landmarks are seen from where they are anchored on"
+    );
+    frame * (frame + 1) / 2 + anchor
+}
+
 /// The joint covariance of the warp, and of the window's poses but the
 /// datum, six rows each.
 type Joint = DMatrix<f64>;
@@ -335,6 +354,17 @@ pub struct Tracked {
     /// How far the frame leaves flat ground, where that is the model: χ² with three degrees of
     /// freedom on ground that is flat.
     pub departure: Option<f64>,
+}
+
+impl Tracked {
+    /// Whether rounding has left its covariances what they should be: where sights hardly determine a
+    /// frame they are so large, and so much larger in one direction than in others, that nothing is
+    /// left of what is small.
+    fn is_determined(&self) -> bool {
+        [&self.cov_pose_right, &self.motion.cov_right]
+            .iter()
+            .all(|cov| consistency::nees(&Vector6::zeros(), cov).is_some())
+    }
 }
 
 /// A landmark seen in the newest frame.

@@ -5,17 +5,17 @@
 //! of the equations by `Jᵀ W D`, points eliminated like all else, and the solution by the joint
 //! covariance times that. What left the window did the same to the prior.
 
-use super::super::calibration::sight_by_skew;
-use super::super::sight;
+use super::super::calibration::seen_by_skew;
+use super::super::sight::{Sight, Viewpoint};
 use super::super::sources::{MODE_COLUMNS, MODES, RigErrors, SKEW_COLUMN};
 use super::landmark::Landmark;
 use super::memory::UnknownsBySources;
-use super::row_of;
 use super::system::{self, At, POINT, Reduced, System, weigh};
 use super::warp::WARP;
+use super::{line_count, line_index, row_of};
 use crate::geometry::product::{product, subtract_product_transposed};
 use crate::simd::widened;
-use nalgebra::{Isometry3, SMatrix, Vector3};
+use nalgebra::{SMatrix, Vector3};
 
 /// Rows for the sources that displace sights: the modes, then, last, the skew. Few do for a rig that states
 /// nothing of its uncertainty.
@@ -32,7 +32,7 @@ pub(super) struct Sensitivity {
 /// What the sources, a row each, so that products run along them, do to the right side.
 #[derive(Clone, Debug)]
 struct Gathered<const ROWS: usize> {
-    /// To the sights of a frame, by their anchor, then by the frame.
+    /// To the sights of a frame by their anchor, by [`line_index`]; then by the frame.
     lines: Vec<SMatrix<f64, ROWS, 6>>,
     frames: Vec<SMatrix<f64, ROWS, 6>>,
     warp: SMatrix<f64, ROWS, WARP>,
@@ -77,7 +77,7 @@ impl Sensitivity {
 impl<const ROWS: usize> Gathered<ROWS> {
     fn with_room(frames: usize) -> Self {
         Self {
-            lines: Vec::with_capacity(frames * frames),
+            lines: Vec::with_capacity(line_count(frames)),
             frames: Vec::with_capacity(frames),
             warp: SMatrix::zeros(),
         }
@@ -85,7 +85,7 @@ impl<const ROWS: usize> Gathered<ROWS> {
 
     fn begin(&mut self, n: usize) {
         self.lines.clear();
-        self.lines.resize(n * n, SMatrix::zeros());
+        self.lines.resize(line_count(n), SMatrix::zeros());
         self.frames.clear();
         self.frames.resize(n, SMatrix::zeros());
         self.warp = SMatrix::zeros();
@@ -93,9 +93,9 @@ impl<const ROWS: usize> Gathered<ROWS> {
 
     /// Hands on what the sightlines gathered to the poses at their two ends.
     fn right_side(&mut self, system: &System, n: usize) -> UnknownsBySources {
-        for anchor in 0..n {
-            for frame in (0..n).filter(|frame| system.is_seen_along(anchor, *frame)) {
-                let line = &self.lines[anchor * n + frame];
+        for frame in 0..n {
+            for anchor in (0..frame).filter(|anchor| system.is_seen_along(*anchor, frame)) {
+                let line = &self.lines[line_index(anchor, frame)];
                 self.frames[frame] += line;
                 self.frames[anchor] -= product(line, system.adjoint(anchor, frame));
             }
@@ -155,17 +155,19 @@ fn gather<const ROWS: usize>(
         };
         let (current, linearised) = system.sightline(anchor, frame);
         let from = linearised.unwrap_or(current);
-        let (Some(seen), Some(px)) = (
-            sight::linearise(at.rig, from, y),
-            sight::seen_at(at.rig, current, y),
-        ) else {
+        let Some(mut seen) = from.linearise(at.rig, y) else {
             continue;
         };
-        let Some(displaced) = displacement::<ROWS>(at, errors, frame, from, y) else {
-            continue;
-        };
-        let residual = at.warp.corrected(&observation.measurement).px
-            - px
+        if linearised.is_some() {
+            let Some(px) = current.seen_at(at.rig, y) else {
+                continue;
+            };
+            seen.px = px;
+        }
+        let displaced = displacement::<ROWS>(at, errors, frame, from, y, &seen);
+        let by_warp = at.warp.derivative(&observation.measurement);
+        let residual = at.warp.corrected_px(&observation.measurement, &by_warp)
+            - seen.px
             - observation.by_relief(&landmark.relief);
         let (info, _, _) = weigh(
             &residual,
@@ -178,9 +180,9 @@ fn gather<const ROWS: usize>(
         }
         by_point += product(&weighted, &system::by_point(&seen, observation));
         let of_right = weighted.fixed_columns::<2>(2).into_owned();
-        gathered.warp += product(&of_right, &at.warp.derivative(&observation.measurement));
+        gathered.warp += by_warp.after(&of_right);
         if frame != anchor {
-            gathered.lines[anchor * at.frames.len() + frame] += product(&weighted, &seen.by_motion);
+            gathered.lines[line_index(anchor, frame)] += product(&weighted, &seen.by_motion);
         }
     }
     let gain = product(&by_point, &reduced.cov);
@@ -196,18 +198,19 @@ fn displacement<const ROWS: usize>(
     at: &At<'_>,
     errors: &RigErrors,
     frame: usize,
-    from: &Isometry3<f64>,
+    from: &Viewpoint,
     y: &Vector3<f64>,
-) -> Option<SMatrix<f64, ROWS, 4>> {
+    seen: &Sight,
+) -> SMatrix<f64, ROWS, 4> {
     let mut by = if errors.has_modes() {
-        errors.displacement::<ROWS>(at.rig, from, y)?
+        errors.displacement::<ROWS>(at.rig, from, y, seen)
     } else {
         SMatrix::zeros()
     };
     let exposure = &at.frames[frame].exposure;
     if exposure.sigma_skew_s > 0.0 {
-        let skew = sight_by_skew(at.rig, from, y, &exposure.twist)? * exposure.sigma_skew_s;
+        let skew = seen_by_skew(seen, &exposure.twist) * exposure.sigma_skew_s;
         by.set_row(ROWS - 1, &skew.transpose());
     }
-    Some(by)
+    by
 }

@@ -2,13 +2,14 @@
 
 use super::super::closed_form::MotionEstimate;
 use super::super::consensus::{self, Room, Search, Sighting};
-use super::super::sight;
 use super::super::sources::{BySources, Exposure, SOURCES};
 use super::datum::Datum;
 use super::dispersion;
+use super::landmark::{Landmark, Observation};
 use super::memory::{ByUnknowns, Memory, UnknownsBySources, carried};
 use super::prior::Prior;
 use super::system::{At, System};
+use super::viewpoints::Viewpoints;
 use super::warp::WARP;
 use super::{Frame, Joint, MAX_FRAMES, Seen, Tracked, Window, row_of};
 use crate::geometry::definite::inverse_from_factor;
@@ -62,9 +63,9 @@ impl State {
 const MAX_DAMPING: f64 = 1e3;
 /// Iterations of Levenberg and Marquardt at most.
 const MAX_ITERATIONS: usize = 12;
-/// The gain in cost, σ², of a step that may be the last: at most a fifth of the σ of any pose. What would
-/// follow is a tenth of that at most, for steps near the end converge quadratically.
-const LAST_GAIN: f64 = 2e-2;
+/// The gain in cost, σ², of a step that may be the last: it moves no pose by more than √(2 · 0.1) = 0.45 σ. What
+/// would follow is a tenth of that at most, for steps near the end converge quadratically.
+const LAST_GAIN: f64 = 1e-1;
 /// Steps before the newest frame's sights are judged for the first time: while wrong ones pull, steps are
 /// many and small.
 const ROUGH_STEPS: usize = 1;
@@ -256,7 +257,8 @@ impl Window {
         self.variance.take(variance_factor);
         self.cov_warp = joint.fixed_view::<WARP, WARP>(0, 0).into_owned();
         self.warp_by_sources = by_sources.fixed_view::<WARP, SOURCES>(0, 0).into_owned();
-        Some(self.tracked(joint, &by_sources, variance_factor, inliers))
+        let tracked = self.tracked(joint, &by_sources, variance_factor, inliers);
+        tracked.is_determined().then_some(tracked)
     }
 
     /// Measures once a keyframe by how much more than chance poses scatter, while all but the newest frame
@@ -454,40 +456,50 @@ impl Window {
     /// Takes out the newest frame's sights that lie beyond the gate; how many.
     fn judge_newest(&mut self) -> usize {
         let limit = self.settings.gate_sigma2 * self.variance.smoothed;
-        let Some(newest) = self.frames.last().map(|f| f.serial) else {
+        let Some(newest) = self.newest_serial() else {
             return 0;
         };
+        let mut viewpoints = std::mem::take(&mut self.viewpoints);
+        viewpoints.begin(self.frames.len());
         let mut wrong = 0;
         for i in 0..self.landmarks.len() {
-            if self.landmarks[i].last_seen() != newest {
+            let landmark = &self.landmarks[i];
+            let Some(last) = landmark.observations.last() else {
+                continue;
+            };
+            if last.serial != newest || landmark.anchor == newest {
                 continue;
             }
-            let judged = self.squared_sigmas(i, newest);
-            if judged.is_none_or(|e| e > limit) && self.landmarks[i].anchor != newest {
+            let judged = self.squared_sigmas(&mut viewpoints, landmark, last);
+            if judged.is_none_or(|e| e > limit) {
                 self.landmarks[i].forget(newest);
                 self.landmarks[i].wrong += 1;
                 wrong += 1;
             }
         }
+        self.viewpoints = viewpoints;
         wrong
     }
 
-    /// Squared residual, σ², of a landmark as one frame saw it.
-    fn squared_sigmas(&self, landmark: usize, serial: u64) -> Option<f64> {
-        let landmark = &self.landmarks[landmark];
-        let anchor = &self.frames[self.frame_index(landmark.anchor)?];
-        let frame = &self.frames[self.frame_index(serial)?];
-        let observation = landmark.observations.iter().find(|o| o.serial == serial)?;
-        let frame_from_anchor = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
-        let seen = sight::seen_at(&self.rig, &frame_from_anchor, &landmark.inverse_depth)?;
-        let m = self.warp.corrected(&observation.measurement);
-        let residual = m.px - seen - observation.by_relief(&landmark.relief);
+    /// Squared residual, σ², of one sight of a landmark.
+    fn squared_sigmas(
+        &self,
+        viewpoints: &mut Viewpoints,
+        landmark: &Landmark,
+        sight: &Observation,
+    ) -> Option<f64> {
+        let anchor = self.frame_index(landmark.anchor)?;
+        let frame = self.frame_index(sight.serial)?;
+        let from = viewpoints.of(&self.rig, &self.frames, anchor, frame);
+        let seen = from.seen_at(&self.rig, &landmark.inverse_depth)?;
+        let m = self.warp.corrected(&sight.measurement);
+        let residual = m.px - seen - sight.by_relief(&landmark.relief);
         Some(residual.component_div(&m.sigma_px).norm_squared())
     }
 
     fn count_newest(&self) -> u32 {
         let newest = self.newest_serial();
-        let seen = |l: &&super::Landmark| Some(l.last_seen()) == newest;
+        let seen = |l: &&Landmark| Some(l.last_seen()) == newest;
         self.landmarks.iter().filter(seen).count() as u32
     }
 
@@ -502,16 +514,21 @@ impl Window {
         for ([_, all], frame) in counted.iter_mut().zip(&self.frames) {
             *all = frame.retired_sights;
         }
+        let mut viewpoints = std::mem::take(&mut self.viewpoints);
+        viewpoints.begin(self.frames.len());
         let mut squares = std::mem::take(&mut self.squares);
         squares.clear();
-        for (i, landmark) in self.landmarks.iter().enumerate() {
+        for landmark in &self.landmarks {
             let counts = landmark.last_seen() == newest && landmark.observations.len() > 1;
             for o in &landmark.observations {
                 if let Some(frame) = self.frame_index(o.serial) {
                     counted[frame][1] += 1;
                     counted[frame][0] += u32::from(counts);
                 }
-                if let Some(e) = self.squared_sigmas(i, o.serial).filter(|_| counts) {
+                if !counts {
+                    continue;
+                }
+                if let Some(e) = self.squared_sigmas(&mut viewpoints, landmark, o) {
                     squares.push(e);
                     freedom += 4.0;
                 }
@@ -520,18 +537,18 @@ impl Window {
                 freedom -= landmark.settled;
             }
         }
+        self.viewpoints = viewpoints;
         for [here, all] in &counted[1..] {
             freedom -= 6.0 * f64::from(*here) / f64::from((*all).max(1));
         }
-        if freedom <= 0.0 {
-            return None;
-        }
-        let middle = squares.len() / 2;
-        let median = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
-        let limit = LARGEST_OVER_MEDIAN * median;
-        let sum: f64 = squares.iter().map(|e| e.min(limit)).sum();
+        let factor = (freedom > 0.0).then(|| {
+            let middle = squares.len() / 2;
+            let median = *squares.select_nth_unstable_by(middle, f64::total_cmp).1;
+            let limit = LARGEST_OVER_MEDIAN * median;
+            squares.iter().map(|e| e.min(limit)).sum::<f64>() / freedom
+        });
         self.squares = squares;
-        Some(sum / freedom)
+        factor
     }
 
     fn tracked(

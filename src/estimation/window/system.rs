@@ -4,18 +4,18 @@
 //! (Schur complement), so that cost grows linearly with the observations.
 
 use super::super::bundle::{huber_loss, huber_weight};
-use super::super::sight::{self, Sight};
+use super::super::sight::{Sight, Viewpoint};
 use super::landmark::{Landmark, Observation};
 use super::memory::Memory;
 use super::warp::{WARP, Warp};
-use super::{Frame, row_of};
+use super::{Frame, line_count, line_index, row_of};
 use crate::geometry::definite::inverse;
 use crate::geometry::product::{
     product, subtract_product_transposed, transposed_product, transposed_scaled,
 };
 use crate::geometry::{StereoRig, se3};
 use crate::simd::widened;
-use nalgebra::{DMatrix, DVector, Isometry3, Matrix6, SMatrix, SVector, Vector2, Vector4, Vector6};
+use nalgebra::{DMatrix, DVector, Matrix2, Matrix6, SMatrix, SVector, Vector2, Vector4, Vector6};
 
 /// Where and how observations are linearised.
 #[derive(Clone, Copy, Debug)]
@@ -53,6 +53,7 @@ impl<'a> At<'a> {
 /// Normal equations, with the working memory for making them.
 #[derive(Clone, Debug, Default)]
 pub(super) struct System {
+    /// By [`line_index`].
     sightlines: Vec<Sightline>,
     frame_count: usize,
     /// Upper triangle of blocks, the datum's included.
@@ -68,9 +69,9 @@ pub(super) struct System {
 /// How one frame sees the landmarks of one anchor, and what they all say of it.
 #[derive(Clone, Debug)]
 struct Sightline {
-    frame_from_anchor: Isometry3<f64>,
+    current: Viewpoint,
     /// The same where the Jacobians are taken, if elsewhere.
-    linearised: Option<Isometry3<f64>>,
+    linearised: Option<Viewpoint>,
     adjoint: Matrix6<f64>,
     adjoint_transposed: Matrix6<f64>,
     information: Matrix6<f64>,
@@ -106,7 +107,7 @@ impl System {
     /// Room for a window of so many frames and landmarks.
     pub(super) fn with_room(frames: usize, landmarks: usize) -> Self {
         Self {
-            sightlines: Vec::with_capacity(frames * frames),
+            sightlines: Vec::with_capacity(line_count(frames)),
             blocks: Vec::with_capacity(frames * frames),
             gradients: Vec::with_capacity(frames),
             by_warp: Vec::with_capacity(frames),
@@ -122,7 +123,7 @@ impl System {
         at: &At<'_>,
         landmarks: impl Iterator<Item = (usize, &'a Landmark)>,
     ) -> f64 {
-        self.begin(at.frames);
+        self.begin(at.rig, at.frames);
         let mut cost = 0.0;
         for (index, landmark) in landmarks {
             cost += eliminate(self, at, index, landmark).unwrap_or(0.0);
@@ -141,32 +142,32 @@ impl System {
         &self.crosses[reduced.crosses.clone()]
     }
 
-    /// Maps a point of an anchor into a frame; and the same where Jacobians were taken, if elsewhere.
+    /// How a frame sees points of an anchor, which is not later; and the same where Jacobians were taken, if elsewhere.
     pub(super) fn sightline(
         &self,
         anchor: usize,
         frame: usize,
-    ) -> (&Isometry3<f64>, Option<&Isometry3<f64>>) {
-        let line = &self.sightlines[anchor * self.frame_count + frame];
-        (&line.frame_from_anchor, line.linearised.as_ref())
+    ) -> (&Viewpoint, Option<&Viewpoint>) {
+        let line = &self.sightlines[line_index(anchor, frame)];
+        (&line.current, line.linearised.as_ref())
     }
 
     /// The adjoint of that.
     pub(super) fn adjoint(&self, anchor: usize, frame: usize) -> &Matrix6<f64> {
-        &self.sightlines[anchor * self.frame_count + frame].adjoint
+        &self.sightlines[line_index(anchor, frame)].adjoint
     }
 
     /// Whether a frame saw landmarks of an anchor other than itself.
     pub(super) fn is_seen_along(&self, anchor: usize, frame: usize) -> bool {
-        self.sightlines[anchor * self.frame_count + frame].is_used
+        self.sightlines[line_index(anchor, frame)].is_used
     }
 
-    fn begin(&mut self, frames: &[Frame]) {
+    fn begin(&mut self, rig: &StereoRig, frames: &[Frame]) {
         let n = frames.len();
         self.frame_count = n;
         self.sightlines.clear();
-        for anchor in frames {
-            for frame in frames {
+        for (i, frame) in frames.iter().enumerate() {
+            for anchor in &frames[..=i] {
                 let current = frame.datum_from_frame.inverse() * anchor.datum_from_frame;
                 let linearised =
                     (anchor.linearised.is_some() || frame.linearised.is_some()).then(|| {
@@ -176,8 +177,8 @@ impl System {
                 self.sightlines.push(Sightline {
                     adjoint,
                     adjoint_transposed: adjoint.transpose(),
-                    frame_from_anchor: current,
-                    linearised,
+                    current: Viewpoint::new(rig, &current),
+                    linearised: linearised.map(|l| Viewpoint::new(rig, &l)),
                     information: Matrix6::zeros(),
                     by_warp: SMatrix::zeros(),
                     gradient: Vector6::zeros(),
@@ -200,21 +201,16 @@ impl System {
     /// Hands on what the sightlines gathered to the poses at their two ends.
     fn expand_sightlines(&mut self) {
         let n = self.frame_count;
-        for anchor in 0..n {
-            for frame in 0..n {
-                let line = &self.sightlines[anchor * n + frame];
+        for frame in 0..n {
+            for anchor in 0..frame {
+                let line = &self.sightlines[line_index(anchor, frame)];
                 if !line.is_used {
                     continue;
                 }
                 let by_anchor = line.information * line.adjoint;
                 self.blocks[frame * n + frame] += line.information;
                 self.blocks[anchor * n + anchor] += line.adjoint.transpose() * by_anchor;
-                let (row, column, block) = if anchor < frame {
-                    (anchor, frame, by_anchor.transpose())
-                } else {
-                    (frame, anchor, by_anchor)
-                };
-                self.blocks[row * n + column] -= block;
+                self.blocks[anchor * n + frame] -= by_anchor.transpose();
                 self.by_warp[frame] += line.by_warp;
                 self.by_warp[anchor] -= line.adjoint.transpose() * line.by_warp;
                 self.gradients[frame] += line.gradient;
@@ -315,21 +311,21 @@ fn eliminate_in(
         let Some(frame) = frames.iter().position(|f| f.serial == observation.serial) else {
             continue;
         };
-        let line = &mut system.sightlines[anchor * system.frame_count + frame];
-        let from = line.linearised.as_ref().unwrap_or(&line.frame_from_anchor);
-        let Some(mut seen) = sight::linearise(rig, from, &landmark.inverse_depth) else {
+        let line = &mut system.sightlines[line_index(anchor, frame)];
+        let from = line.linearised.as_ref().unwrap_or(&line.current);
+        let Some(mut seen) = from.linearise(rig, &landmark.inverse_depth) else {
             continue;
         };
         if line.linearised.is_some() {
-            let Some(px) = sight::seen_at(rig, &line.frame_from_anchor, &landmark.inverse_depth)
-            else {
+            let Some(px) = line.current.seen_at(rig, &landmark.inverse_depth) else {
                 continue;
             };
             seen.px = px;
         }
         sights += 1;
+        let by_warp = warp.derivative(&observation.measurement);
         let (info, residual, loss) = weigh(
-            &(warp.corrected(&observation.measurement).px
+            &(warp.corrected_px(&observation.measurement, &by_warp)
                 - seen.px
                 - observation.by_relief(&landmark.relief)),
             &observation.measurement.sigma_px,
@@ -340,19 +336,19 @@ fn eliminate_in(
         let weighted = transposed_scaled(&seen_by_point, &info);
         point_point += product(&weighted, &seen_by_point);
         point_gradient += product(&weighted, &residual);
-        let by_warp = warp.derivative(&observation.measurement);
-        let warp_weighted = transposed_scaled(&by_warp, &Vector2::new(info[2], info[3]));
-        warp_warp += product(&warp_weighted, &by_warp);
-        let right_by_point = seen_by_point.fixed_rows::<2>(2).into_owned();
-        warp_point += product(&warp_weighted, &right_by_point);
-        warp_gradient += product(&warp_weighted, &Vector2::new(residual[2], residual[3]));
+        let of_right = Matrix2::new(info[2], 0.0, 0.0, info[3]);
+        warp_warp += by_warp.transposed_before(&by_warp.after(&of_right));
+        let of_right = weighted.fixed_columns::<2>(2).transpose();
+        warp_point += by_warp.transposed_before(&of_right);
+        let of_right = Vector2::new(info[2] * residual[2], info[3] * residual[3]);
+        warp_gradient += by_warp.transposed_before(&of_right);
         if frame == anchor {
             continue;
         }
         let weighted = transposed_scaled(&seen.by_motion, &info);
         line.information += product(&weighted, &seen.by_motion);
         let of_right = weighted.fixed_columns::<2>(2).into_owned();
-        line.by_warp += product(&of_right, &by_warp);
+        line.by_warp += by_warp.after(&of_right);
         line.gradient += product(&weighted, &residual);
         line.is_used = true;
         let by_point = product(&weighted, &seen_by_point);

@@ -8,19 +8,63 @@
 //! other errors. What is not known of either goes into the covariance of every pose.
 
 use super::super::calibration::sight_by_rig;
-use super::super::{Settings, StereoMeasurement, seen_at};
+use super::super::{Settings, StereoMeasurement, Viewpoint};
 use crate::geometry::StereoRig;
 use crate::geometry::product::{product, product_transposed};
 use crate::geometry::rig_parameters::RIG_PARAMETERS;
-use nalgebra::{DVector, Isometry3, Matrix2, SMatrix, SVector, Vector2, Vector4};
+use nalgebra::{DVector, Matrix2, SMatrix, SVector, Vector2, Vector4};
 
 /// Terms across the baseline: 1, x, y, x², xy, y².
 const TERMS: usize = 6;
 /// Unknowns: the displacement along the baseline, then the terms across it.
 pub(in super::super) const WARP: usize = 1 + TERMS;
 
-/// Derivative of the displacement, px, by the unknowns.
-pub(super) type ByWarp = SMatrix<f64, 2, WARP>;
+/// Derivative of the displacement at one place, px, by the unknowns: the first displaces along the
+/// baseline, the others across it, by their terms there. Products know it, which halves them.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct ByWarp {
+    along: Vector2<f64>,
+    across: Vector2<f64>,
+    terms: SVector<f64, TERMS>,
+}
+
+impl ByWarp {
+    /// Itself, `B`.
+    fn matrix(&self) -> SMatrix<f64, 2, WARP> {
+        self.after(&Matrix2::identity())
+    }
+
+    /// `m B`.
+    #[inline(always)]
+    pub(super) fn after<const R: usize>(&self, m: &SMatrix<f64, R, 2>) -> SMatrix<f64, R, WARP> {
+        let across = product(m, &self.across);
+        let mut out = SMatrix::<f64, R, WARP>::zeros();
+        out.set_column(0, &product(m, &self.along));
+        for term in 0..TERMS {
+            for row in 0..R {
+                out.data.0[1 + term][row] = across[row] * self.terms[term];
+            }
+        }
+        out
+    }
+
+    /// `Bᵀ m`.
+    #[inline(always)]
+    pub(super) fn transposed_before<const C: usize>(
+        &self,
+        m: &SMatrix<f64, 2, C>,
+    ) -> SMatrix<f64, WARP, C> {
+        let mut out = SMatrix::<f64, WARP, C>::zeros();
+        for (out, m) in out.data.0.iter_mut().zip(&m.data.0) {
+            out[0] = self.along.x * m[0] + self.along.y * m[1];
+            let across = self.across.x * m[0] + self.across.y * m[1];
+            for term in 0..TERMS {
+                out[1 + term] = across * self.terms[term];
+            }
+        }
+        out
+    }
+}
 
 /// A covariance of all unknowns, px².
 pub(super) type WarpCovariance = SMatrix<f64, WARP, WARP>;
@@ -53,16 +97,15 @@ impl Warp {
     }
 
     /// By how much each unknown displaces what the right camera saw, px.
+    #[inline]
     pub(super) fn derivative(&self, measurement: &StereoMeasurement) -> ByWarp {
         let at = (measurement.right_px() - self.centre_px) / self.half_width_px;
         let (x, y) = (at.x, at.y);
-        let terms = SMatrix::<f64, 1, TERMS>::from([[1.0], [x], [y], [x * x], [x * y], [y * y]]);
-        let mut by_warp = ByWarp::zeros();
-        by_warp.set_column(0, &self.along);
-        by_warp
-            .fixed_columns_mut::<TERMS>(1)
-            .copy_from(&(self.across * terms));
-        by_warp
+        ByWarp {
+            along: self.along,
+            across: self.across,
+            terms: SVector::from([1.0, x, y, x * x, x * y, y * y]),
+        }
     }
 
     /// Covariance, px², of the displacement there, for one of the unknowns.
@@ -71,17 +114,32 @@ impl Warp {
         measurement: &StereoMeasurement,
         cov_warp: &WarpCovariance,
     ) -> Matrix2<f64> {
-        let by_warp = self.derivative(measurement);
+        let by_warp = self.derivative(measurement).matrix();
         product_transposed(&product(&by_warp, cov_warp), &by_warp)
     }
 
     /// The measurement that a rig as calibrated would have made.
     pub(super) fn corrected(&self, measurement: &StereoMeasurement) -> StereoMeasurement {
-        let displacement = self.derivative(measurement) * self.coefficients;
-        let mut corrected = *measurement;
-        corrected.px[2] -= displacement.x;
-        corrected.px[3] -= displacement.y;
-        corrected
+        StereoMeasurement {
+            px: self.corrected_px(measurement, &self.derivative(measurement)),
+            ..*measurement
+        }
+    }
+
+    /// The pixels of [`corrected`](Self::corrected), `by_warp` being the derivative there.
+    #[inline(always)]
+    pub(super) fn corrected_px(
+        &self,
+        measurement: &StereoMeasurement,
+        by_warp: &ByWarp,
+    ) -> Vector4<f64> {
+        let terms = self.coefficients.fixed_rows::<TERMS>(1).into_owned();
+        let displacement =
+            by_warp.along * self.coefficients[0] + by_warp.across * by_warp.terms.dot(&terms);
+        let mut px = measurement.px;
+        px[2] -= displacement.x;
+        px[3] -= displacement.y;
+        px
     }
 
     /// Adds a step of all unknowns, which stand first in `step`.
@@ -108,17 +166,19 @@ fn stated_covariance(rig: &StereoRig) -> Option<WarpCovariance> {
     let warp = Warp::new(rig);
     let mut normal = WarpCovariance::zeros();
     let mut by_rig = SMatrix::<f64, WARP, RIG_PARAMETERS>::zeros();
+    let from = Viewpoint::unmoved(rig);
     for ray in rig.left.spread_rays() {
         let infinity = ray.push(0.0);
-        let identity = Isometry3::identity();
         let (Some(px), Some(by)) = (
-            seen_at(rig, &identity, &infinity),
-            sight_by_rig(rig, &identity, &infinity),
+            from.seen_at(rig, &infinity),
+            sight_by_rig(rig, &from, &infinity),
         ) else {
             continue;
         };
         let sigma_px = Vector4::zeros();
-        let by_warp = warp.derivative(&StereoMeasurement { px, sigma_px });
+        let by_warp = warp
+            .derivative(&StereoMeasurement { px, sigma_px })
+            .matrix();
         normal += by_warp.transpose() * by_warp;
         by_rig += by_warp.transpose() * (by.fixed_rows::<2>(2) - by.fixed_rows::<2>(0));
     }
