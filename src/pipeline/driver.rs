@@ -10,6 +10,7 @@
 //! under way at once: their buffers go round, so that nothing is allocated after the first few.
 
 use super::method::{Described, DescribedPair, Method, StepError};
+use super::overlap::Overlap;
 use crate::capture::{PairEvent, PairSource, Side, Skew, StereoPair, Unusable};
 use crate::estimation::{Odometry, PairStamp};
 use crate::features::Extractor;
@@ -163,7 +164,9 @@ pub fn run<S: PairSource, E>(
         }
         std::thread::Builder::new()
             .name("feeder".to_owned())
-            .spawn_scoped(scope, move || feed(source, &spare, &jobs_in, &done_in))
+            .spawn_scoped(scope, move || {
+                feed(source, under_way, &spare, &jobs_in, &done_in);
+            })
             .map_err(PipelineError::Thread)?;
         // Whatever ends this loop drops its ends of the queues, which ends the threads.
         drop(jobs);
@@ -210,19 +213,49 @@ enum Done {
     WorkerDied,
 }
 
-/// Reads the source as fast as buffers come back.
+/// Buffers that are not in use, of those that go round.
+struct Spares<'a> {
+    coming_back: &'a Receiver<Spare>,
+    /// Held back, so that fewer pairs are under way.
+    held: Vec<Spare>,
+    all: usize,
+}
+
+impl Spares<'_> {
+    /// Those for one more pair, as soon as it is one of `under_way` at most; `None` when the run is over.
+    fn take<S: PairSource>(&mut self, under_way: usize, source: &mut S) -> Option<Spare> {
+        loop {
+            if self.held.len() > self.all - under_way {
+                return self.held.pop();
+            }
+            let mut buffers = self.coming_back.recv().ok()?;
+            if let Some(pair) = buffers.used.take() {
+                source.recycle(pair);
+            }
+            self.held.push(buffers);
+        }
+    }
+}
+
+/// Reads the source as fast as buffers come back; a live one with fewer of them where it is too fast.
 fn feed<S: PairSource>(
     mut source: S,
+    under_way: usize,
     spare: &Receiver<Spare>,
     jobs: &Sender<Job>,
     done: &Sender<Done>,
 ) {
     let mut ticket = 0;
+    let mut spares = Spares {
+        coming_back: spare,
+        held: Vec::with_capacity(under_way),
+        all: under_way,
+    };
+    let mut overlap = Overlap::new(under_way);
+    let (is_live, began) = (source.is_live(), Instant::now());
     prepare_thread();
-    while let Ok(mut buffers) = spare.recv() {
-        if let Some(pair) = buffers.used.take() {
-            source.recycle(pair);
-        }
+    while let Some(buffers) = spares.take(overlap.under_way(), &mut source) {
+        let asked = Instant::now();
         let sent = match source.next_event() {
             None => return,
             Some(PairEvent::Unusable(unusable)) => done
@@ -234,6 +267,11 @@ fn feed<S: PairSource>(
                 .is_ok(),
             Some(PairEvent::Pair(pair)) => {
                 let arrived = Instant::now();
+                let waited = arrived.duration_since(asked);
+                if is_live && overlap.take(pair.sequence, arrived.duration_since(began), waited) {
+                    let under_way = overlap.under_way();
+                    tracing::info!(under_way, "pairs under way at once, for how fast they come");
+                }
                 let stamp = PairStamp {
                     sequence: pair.sequence,
                     timestamp_ns: pair.timestamp_ns,
@@ -465,16 +503,17 @@ mod tests {
     use std::sync::Arc;
     use std::sync::atomic::{AtomicU64, Ordering};
 
-    /// A source that always has one more pair, and counts those that it was asked for.
+    /// A source that always has one more pair, `came` after the last one, and counts those that it was asked for.
     struct Eager {
         pair: StereoPair,
         is_live: bool,
+        came: u64,
         asked_for: Arc<AtomicU64>,
     }
 
     impl PairSource for Eager {
         fn next_event(&mut self) -> Option<PairEvent> {
-            let sequence = self.asked_for.fetch_add(1, Ordering::SeqCst);
+            let sequence = self.came * self.asked_for.fetch_add(1, Ordering::SeqCst);
             Some(PairEvent::Pair(StereoPair {
                 sequence,
                 timestamp_ns: 100_000_000 * sequence as i64,
@@ -487,8 +526,8 @@ mod tests {
         }
     }
 
-    /// The greatest number of pairs under way when a row comes, over 40 rows of which each takes its time.
-    fn most_under_way(is_live: bool, workers: usize) -> u64 {
+    /// The numbers of pairs under way when a row comes, of 40 rows of which each takes its time.
+    fn under_way(is_live: bool, workers: usize, came: u64) -> Vec<u64> {
         let (scene, way) = (SceneName::Room, TrajectoryName::LoopRoom);
         let simulation = Simulation::new(scene, way, small_rig(), Simulated::default());
         let simulation = simulation.expect("fits");
@@ -496,6 +535,7 @@ mod tests {
         let source = Eager {
             pair: simulation.pair(0).0,
             is_live,
+            came,
             asked_for: Arc::clone(&asked_for),
         };
         let mut settings = features::Settings::default();
@@ -503,27 +543,35 @@ mod tests {
         let extractors = (0..workers).map(|_| features::extractor(&settings).expect("valid"));
         let mut method = Method::new(small_rig(), Default::default(), Default::default())
             .expect("has a baseline");
-        let (mut rows, mut most) = (0, 0);
+        let mut under_way = Vec::new();
         let run = run(source, extractors.collect(), &mut method, |_| {
             // Long enough for all others to take what they may.
             std::thread::sleep(Duration::from_millis(20));
-            most = most.max(asked_for.load(Ordering::SeqCst) - rows);
-            rows += 1;
-            Ok::<_, Infallible>(if rows < 40 {
+            under_way.push(asked_for.load(Ordering::SeqCst) - under_way.len() as u64);
+            Ok::<_, Infallible>(if under_way.len() < 40 {
                 ControlFlow::Continue(())
             } else {
                 ControlFlow::Break(())
             })
         });
         assert!(run.is_ok());
-        most
+        under_way
     }
 
     #[test]
     fn live_pairs_wait_with_their_source_and_recorded_ones_in_the_pipeline() {
         // The one whose row it is, and one in which features are looked for.
-        assert_eq!(most_under_way(true, 2), 2);
-        assert_eq!(most_under_way(true, 4), 3);
-        assert_eq!(most_under_way(false, 2), 4);
+        assert_eq!(under_way(true, 2, 1).into_iter().max(), Some(2));
+        assert_eq!(under_way(true, 4, 1).into_iter().max(), Some(3));
+        assert_eq!(under_way(false, 2, 1).into_iter().max(), Some(4));
+    }
+
+    #[test]
+    fn of_live_pairs_that_come_twice_as_fast_as_they_are_handled_one_is_under_way() {
+        let live = under_way(true, 2, 2);
+        assert_eq!(live[..10].iter().max(), Some(&2));
+        assert!(live[24..].iter().all(|n| *n == 1), "{live:?}");
+        // Whatever the numbers of recorded ones are, they are in no hurry.
+        assert_eq!(under_way(false, 2, 2)[24..].iter().max(), Some(&4));
     }
 }

@@ -8,6 +8,7 @@ mod gallery;
 mod histogram;
 mod method;
 mod occupancy;
+mod overlap;
 mod repeats;
 mod statistics;
 mod trim;

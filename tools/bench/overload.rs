@@ -93,6 +93,18 @@ fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
         );
         began_s = *end_s;
     }
+    let late: Vec<String> = arrivals
+        .iter()
+        .filter(|arrival| (ends_s[0]..ends_s[1]).contains(&at_s(arrival)))
+        .filter(|arrival| arrival.latency_ms > 2e3 / rate_hz)
+        .map(|arrival| format!("{:.2}", at_s(arrival) - ends_s[0]))
+        .collect();
+    println!(
+        "\n{} came later than two frame times, {:.1} ms, under overload, so many seconds after it began: {}",
+        late.len(),
+        2e3 / rate_hz,
+        late.join(", ")
+    );
     // The first pair after which none is dropped any more.
     let over_s = ends_s[1];
     let last_gap = arrivals
@@ -101,7 +113,7 @@ fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
         .map(|two| at_s(&two[1]))
         .next_back();
     println!(
-        "\n{} dropped in the queue by the daemon's own count; the last gap in what arrives ends {:.0} ms after \
+        "{} dropped in the queue by the daemon's own count; the last gap in what arrives ends {:.0} ms after \
          the overload",
         summary["dropped"],
         last_gap.map_or(0.0, |gap_s| 1e3 * (gap_s - over_s))
