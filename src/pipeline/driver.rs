@@ -7,7 +7,8 @@
 //!
 //! Workers take images, left and right alike, as they come; rows leave in the order of the pairs,
 //! and what is in them does not depend on how many workers there are. A fixed number of pairs is
-//! under way at once: their buffers go round, so that nothing is allocated after the first few.
+//! under way at once, or fewer where a live source is too fast ([`super::overlap`]): their buffers go round,
+//! so that nothing is allocated after the first few.
 
 use super::method::{Described, DescribedPair, Method, StepError};
 use super::overlap::Overlap;

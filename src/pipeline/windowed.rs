@@ -25,6 +25,10 @@ const TRACK_REACH_PX: f64 = 4.0;
 const RIGHT_REACH_PX: f64 = 3.0;
 /// Pairs in a row in which a landmark may be missed before it is given up.
 const MAX_MISSED: u32 = 2;
+const _: () = assert!(
+    (MAX_MISSED as usize) < window::UNSEEN_KEYFRAMES,
+    "a landmark is looked for that the window may have retired"
+);
 /// New landmarks in a cell of the image at most, old ones included.
 const MOST_IN_A_CELL: u32 = 8;
 /// Pairs after which a landmark's vote counts in full: what has stood still for long has more of a say than what has

@@ -1,4 +1,4 @@
-//! Pairs that come twice as fast as they can be handled: `cargo bench --bench overload [-- SECONDS]`.
+//! Pairs that come twice as fast as they can be handled: `cargo bench --bench overload [-- SECONDS [large]]`.
 //!
 //! First it is measured how fast pairs can be handled; then they come at half of that, at twice that for a
 //! minute, and at half of it again. Latencies are those of a subscriber in another process: from when the
@@ -6,9 +6,11 @@
 
 mod common;
 
-use common::daemon::{Daemon, record};
+use common::daemon::{Daemon, record, render};
+use common::memory::Recording;
 use common::words;
 use visod::output::monotonic_ns;
+use visod::simulation::{small_rig, thesis_rig};
 
 /// Before and after the overload, s.
 const CALM_S: f64 = 10.0;
@@ -24,27 +26,37 @@ struct Arrival {
 }
 
 fn main() -> Outcome {
-    let seconds = words().first().map_or(Ok(60.0), |s| s.parse())?;
+    let words = words();
+    let seconds = words.first().map_or(Ok(60.0), |s| s.parse())?;
+    // Far more than can be handled, and no more than can be read.
+    let (rig, flood_hz) = match words.get(1).map(String::as_str) {
+        None => (small_rig(), 400.0),
+        Some("large") => (thesis_rig(), 100.0),
+        Some(other) => return Err(format!("{other}: neither nothing nor `large`").into()),
+    };
+    let size = format!("{} × {} px", rig.left.width, rig.left.height);
+    let images = render(rig);
     for trim in [false, true] {
         println!(
-            "\n### Overload, 320 × 240 px, trimming {}\n",
+            "\n### Overload, {size}, trimming {}\n",
             if trim { "on" } else { "off" }
         );
         let more = format!("[service]\ntrim = {trim}\n");
-        // Far more than can be handled: what comes out is how fast that is.
-        let flood: Vec<f64> = (0..4000).map(|n| f64::from(n) / 400.0).collect();
-        let handled = follow(&flood, "[service]\ntrim = false\n")?.0;
+        let flood: Vec<f64> = (0..10 * flood_hz as u32)
+            .map(|n| f64::from(n) / flood_hz)
+            .collect();
+        let handled = follow(&images, &flood, "[service]\ntrim = false\n")?.0;
         let (first, last) = (handled[handled.len() / 4], handled[handled.len() - 1]);
         let span_s = (last.taken_ns - first.taken_ns) as f64 * 1e-9;
         let rate_hz = (handled.len() - handled.len() / 4 - 1) as f64 / span_s;
         let frame_ms = 1e3 / rate_hz;
         println!("{rate_hz:.1} pairs a second can be handled: {frame_ms:.2} ms a pair\n");
-        overload(rate_hz, seconds, &more)?;
+        overload(&images, rate_hz, seconds, &more)?;
     }
     Ok(())
 }
 
-fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
+fn overload(images: &Recording, rate_hz: f64, seconds: f64, more: &str) -> Outcome {
     let phases = [
         ("half as fast as they can be handled", 0.5, CALM_S),
         ("twice as fast", 2.0, seconds),
@@ -60,7 +72,7 @@ fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
             times_s.push(last_s + 1.0 / (factor * rate_hz));
         }
     }
-    let (arrivals, summary) = follow(&times_s, more)?;
+    let (arrivals, summary) = follow(images, &times_s, more)?;
     let Some(first) = arrivals.first() else {
         return Err("nothing arrives".into());
     };
@@ -123,12 +135,13 @@ fn overload(rate_hz: f64, seconds: f64, more: &str) -> Outcome {
 
 /// All that arrives of pairs that come at the given times, and the daemon's summary.
 fn follow(
+    images: &Recording,
     times_s: &[f64],
     more: &str,
 ) -> Result<(Vec<Arrival>, serde_json::Value), Box<dyn std::error::Error>> {
     let folder = tempfile::tempdir()?;
     let recording = folder.path().join("recording");
-    record(&recording, times_s)?;
+    record(images, &recording, times_s)?;
     let daemon = Daemon::start(folder.path(), &recording, more)?;
     let mut arrivals = Vec::with_capacity(times_s.len());
     let (summary, lost) = daemon.follow(|message| {

@@ -5,9 +5,10 @@
 
 mod common;
 
-use common::daemon::{Daemon, record};
+use common::daemon::{Daemon, record, render};
 use common::words;
 use std::path::Path;
+use visod::simulation::small_rig;
 
 type Fallible<T> = Result<T, Box<dyn std::error::Error>>;
 
@@ -58,7 +59,7 @@ fn main() -> Fallible<()> {
     let folder = tempfile::tempdir()?;
     let recording = folder.path().join("recording");
     let times_s: Vec<f64> = (0..pairs).map(|n| n as f64 / rate_hz).collect();
-    record(&recording, &times_s)?;
+    record(&render(small_rig()), &recording, &times_s)?;
     let more = format!(
         "[features.surf]\nbudget = 80\n[metrics]\nlisten = \"{0}/metrics\"\n[last_pose]\nfile = \"{0}/last_pose.toml\"\nevery_s = 1.0\n",
         folder.path().display()

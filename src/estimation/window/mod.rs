@@ -46,6 +46,7 @@ use memory::Memory;
 use nalgebra::{DMatrix, Isometry3, Matrix6, SMatrix, Vector2, Vector4, Vector6};
 use planar::Ground;
 use prior::Prior;
+pub use retirement::UNSEEN_KEYFRAMES;
 use sensitivity::Sensitivity;
 use solve::{Sightings, State};
 use system::System;

@@ -7,8 +7,8 @@
 use super::{Frame, Landmark, Window};
 
 /// A landmark that none of the last so many keyframes saw will not be found again: those who look for it have
-/// given it up by then.
-const UNSEEN_KEYFRAMES: usize = 3;
+/// to give it up earlier.
+pub const UNSEEN_KEYFRAMES: usize = 3;
 
 impl Window {
     /// Hands what landmarks say that the last keyframes did not see on to the prior, where that knows all

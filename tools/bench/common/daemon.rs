@@ -4,24 +4,26 @@ use super::memory::Recording;
 use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
-use visod::geometry::rig_to_toml;
+use visod::geometry::{StereoRig, rig_to_toml};
 use visod::output::message::OdometryMessage;
 use visod::output::publication::Settings as Publication;
 use visod::output::subscriber::{OdometrySubscriber, Wake};
-use visod::simulation::small_rig;
 
 type Fallible<T> = Result<T, Box<dyn std::error::Error>>;
 
 /// Pairs that are rendered; the cameras show them forth and back.
 const RENDERED: u64 = 24;
 
-/// A recording of small images, 320 × 240 px, whose pairs come at the given times; they are files that cost
-/// little to read.
+/// Images of a rig, rendered once for many recordings.
+pub fn render(rig: StereoRig) -> Recording {
+    Recording::simulated(rig, RENDERED)
+}
+
+/// A recording of these images whose pairs come at the given times; they are files that cost little to read.
 ///
 /// # Errors
 /// The disk is full, or has no hard links.
-pub fn record(folder: &Path, times_s: &[f64]) -> Fallible<()> {
-    let recording = Recording::simulated(small_rig(), RENDERED);
+pub fn record(recording: &Recording, folder: &Path, times_s: &[f64]) -> Fallible<()> {
     let name = |side: &str, n: u64| folder.join(format!("{side}/{n:06}.pgm"));
     for side in ["left", "right"] {
         std::fs::create_dir_all(folder.join(side))?;
