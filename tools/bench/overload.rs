@@ -1,8 +1,8 @@
-//! Pairs that come twice as fast as they can be handled: `cargo bench --bench overload [-- SECONDS [large]]`.
+//! Pairs that come twice as fast as they can be handled: `cargo bench --bench overload [-- SECONDS [large [HZ]]]`.
 //!
 //! First it is measured how fast pairs can be handled; then they come at half of that, at twice that for a
-//! minute, and at half of it again. Latencies are those of a subscriber in another process: from when the
-//! left image was taken to when the message is here.
+//! minute, and at half of it again. With HZ they come at that rate alone. Latencies are those of a subscriber in
+//! another process: from when the left image was taken to when the message is here.
 
 mod common;
 
@@ -36,6 +36,9 @@ fn main() -> Outcome {
     };
     let size = format!("{} × {} px", rig.left.width, rig.left.height);
     let images = render(rig);
+    if let Some(rate_hz) = words.get(2) {
+        return steady(&images, rate_hz.parse()?, seconds);
+    }
     for trim in [false, true] {
         println!(
             "\n### Overload, {size}, trimming {}\n",
@@ -53,6 +56,29 @@ fn main() -> Outcome {
         println!("{rate_hz:.1} pairs a second can be handled: {frame_ms:.2} ms a pair\n");
         overload(&images, rate_hz, seconds, &more)?;
     }
+    Ok(())
+}
+
+/// The latency of pairs that come at one rate, which can be kept up with.
+fn steady(images: &Recording, rate_hz: f64, seconds: f64) -> Outcome {
+    let times_s: Vec<f64> = (0..(rate_hz * seconds) as u32)
+        .map(|n| f64::from(n) / rate_hz)
+        .collect();
+    let (arrivals, summary) = follow(images, &times_s, "")?;
+    let mut latencies: Vec<f64> = arrivals.iter().map(|arrival| arrival.latency_ms).collect();
+    latencies.sort_by(f64::total_cmp);
+    let quantile = |share: f64| latencies[(share * (latencies.len() - 1) as f64) as usize];
+    println!("| pairs a second | came | handled | latency: median ms | p99 ms | max ms |");
+    println!("|---:|---:|---:|---:|---:|---:|");
+    println!(
+        "| {rate_hz} | {} | {} | {:.1} | {:.1} | {:.1} |\n\n{} dropped in the queue by the daemon's own count",
+        times_s.len(),
+        latencies.len(),
+        quantile(0.5),
+        quantile(0.99),
+        quantile(1.0),
+        summary["dropped"]
+    );
     Ok(())
 }
 

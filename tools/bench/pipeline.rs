@@ -13,7 +13,6 @@ use common::{memory_mb, ms, process_time, thread_time, words};
 use std::convert::Infallible;
 use std::ops::ControlFlow;
 use std::time::{Duration, Instant};
-use visod::capture::Realtime;
 use visod::capture::{PairEvent, PairSource, StereoPair};
 use visod::features::{self, Extractor};
 use visod::geometry::StereoRig;
@@ -24,6 +23,8 @@ use visod::simulation::{small_rig, thesis_rig};
 const PAIRS: u64 = 100;
 /// Pairs before that, which grow the buffers.
 const WARM_UP: u64 = 20;
+/// Pairs of the measurement at a rate.
+const PACED: u64 = 400;
 /// Different pairs of a simulated recording.
 const FRAMES: u64 = 12;
 
@@ -307,40 +308,87 @@ fn endurance(pairs: u64) {
     Run::over(&recording.rig, source, 1000, 2, see);
 }
 
-/// Stamps pairs with the rate at which they are to come.
-struct Rate(ToAndFro, f64);
+/// Two cameras that show a recording at a rate, whether or not anybody is ready: of two pairs that wait the older
+/// one is lost.
+struct Cameras {
+    recording: ToAndFro,
+    began: Instant,
+    period: Duration,
+    next: u32,
+}
 
-impl PairSource for Rate {
+impl Cameras {
+    /// When a pair is there.
+    fn due(&self, place: u32) -> Instant {
+        self.began + self.period * place
+    }
+}
+
+impl PairSource for Cameras {
     fn next_event(&mut self) -> Option<PairEvent> {
-        let mut event = self.0.next_event()?;
-        if let PairEvent::Pair(pair) = &mut event {
-            pair.timestamp_ns = (pair.sequence as f64 * 1e9 / self.1) as i64;
+        while Instant::now() >= self.due(self.next + 1) {
+            self.recording.skip();
+            self.next += 1;
         }
+        let event = self.recording.next_event()?;
+        std::thread::sleep(
+            self.due(self.next)
+                .saturating_duration_since(Instant::now()),
+        );
+        self.next += 1;
         Some(event)
     }
 
+    fn is_live(&self) -> bool {
+        true
+    }
+
     fn make_room(&mut self, pairs_held: usize) {
-        self.0.make_room(pairs_held);
+        self.recording.make_room(pairs_held);
     }
 
     fn recycle(&mut self, pair: StereoPair) {
-        self.0.recycle(pair);
+        self.recording.recycle(pair);
     }
 }
 
 fn paced(rate_hz: f64) {
     println!("\n### Latency at {rate_hz} pairs a second, 1280 × 960, 1,000 keypoints an image\n");
-    println!("| median ms | p99 ms | slowest ms | pairs a second |");
-    println!("|---:|---:|---:|---:|");
+    println!("| median ms | p99 ms | slowest ms | pairs a second | lost |");
+    println!("|---:|---:|---:|---:|---:|");
     let recording = Recording::simulated(thesis_rig(), FRAMES);
-    let source = Rate(recording.source(WARM_UP + 400), rate_hz);
-    let run = Run::over(&recording.rig, Realtime::new(source), 1000, 2, |_| ());
-    let at = |share: f64| run.quantile_ms(|l| l.total, share);
+    let Some(mut method) = Method::new(recording.rig.clone(), Default::default(), estimation())
+    else {
+        unreachable!("the cameras stand side by side")
+    };
+    let period = Duration::from_secs_f64(1.0 / rate_hz);
+    // The threads are there by then.
+    let began = Instant::now() + Duration::from_millis(100);
+    let cameras = Cameras {
+        recording: recording.source(WARM_UP + PACED),
+        began,
+        period,
+        next: 0,
+    };
+    let mut latencies = Vec::with_capacity(PACED as usize);
+    let deliver = |delivery: Delivery<'_>| {
+        let sequence = delivery.odometry.sequence;
+        if sequence >= WARM_UP {
+            latencies.push((began + period * sequence as u32).elapsed());
+        }
+        Ok::<_, Infallible>(ControlFlow::Continue(()))
+    };
+    let extractors = vec![extractor(1000), extractor(1000)];
+    let result = pipeline::run(cameras, extractors, &mut method, deliver);
+    assert!(result.is_ok());
+    latencies.sort_unstable();
+    let at = |share: f64| ms(latencies[(share * (latencies.len() - 1) as f64) as usize]);
     println!(
-        "| {:.1} | {:.1} | {:.1} | {:.1} |",
+        "| {:.1} | {:.1} | {:.1} | {:.1} | {} |",
         at(0.5),
         at(0.99),
         at(1.0),
-        1e3 / run.wall_ms
+        rate_hz * latencies.len() as f64 / PACED as f64,
+        PACED - latencies.len() as u64
     );
 }

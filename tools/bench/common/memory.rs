@@ -90,6 +90,13 @@ pub struct ToAndFro {
     spare: Vec<StereoPair>,
 }
 
+impl ToAndFro {
+    /// Leaves the next pair out.
+    pub fn skip(&mut self) {
+        self.next += 1;
+    }
+}
+
 impl PairSource for ToAndFro {
     fn next_event(&mut self) -> Option<PairEvent> {
         if self.next >= self.count {
