@@ -26,22 +26,22 @@ pub struct Sight {
 /// Where a rig has gone: made once, then asked for many points.
 #[derive(Clone, Copy, Debug)]
 pub struct Viewpoint {
-    left: Camerawards,
-    right: Camerawards,
+    left: ToCamera,
+    right: ToCamera,
     right_from_left: Matrix3<f64>,
 }
 
 /// A point times ρ, in the frame of a camera: affine in (x, y, ρ).
 #[derive(Clone, Copy, Debug)]
-struct Camerawards {
+struct ToCamera {
     by_point: Matrix3<f64>,
     /// Where (0, 0, 0) comes out, straight ahead and infinitely far.
     ahead: Vector3<f64>,
 }
 
-impl Camerawards {
+impl ToCamera {
     #[inline(always)]
-    fn take(&self, y: &Vector3<f64>) -> Vector3<f64> {
+    fn apply(&self, y: &Vector3<f64>) -> Vector3<f64> {
         product(&self.by_point, y) + self.ahead
     }
 }
@@ -53,7 +53,7 @@ impl Viewpoint {
     pub fn new(rig: &StereoRig, now_from_prev: &Isometry3<f64>) -> Self {
         let rotation = now_from_prev.rotation.to_rotation_matrix();
         let right_from_left = rig.right_from_left.rotation.to_rotation_matrix();
-        let left = Camerawards {
+        let left = ToCamera {
             by_point: Matrix3::from_columns(&[
                 rotation.matrix().column(0).into_owned(),
                 rotation.matrix().column(1).into_owned(),
@@ -61,7 +61,7 @@ impl Viewpoint {
             ]),
             ahead: rotation.matrix().column(2).into_owned(),
         };
-        let mut right = Camerawards {
+        let mut right = ToCamera {
             by_point: right_from_left * left.by_point,
             ahead: right_from_left * left.ahead,
         };
@@ -83,7 +83,7 @@ impl Viewpoint {
     /// The point times ρ, in the left camera and in the right one.
     #[inline]
     pub(super) fn of_cameras(&self, y: &Vector3<f64>) -> [Vector3<f64>; 2] {
-        [self.left.take(y), self.right.take(y)]
+        [self.left.apply(y), self.right.apply(y)]
     }
 
     /// Where `rig` sees the point `y` = (x, y, ρ) from there: (ul, vl, ur, vr), px. `None` where a
