@@ -112,10 +112,14 @@ pub fn of_motion<'a>(
     let mut by_skew = Vector6::zeros();
     for (point, influence) in tracks {
         let y = &point.inverse_depth;
-        by_rig += product(&influence.by_prev, &sight_by_rig(rig, &before, y)?);
-        by_rig += product(&influence.by_now, &sight_by_rig(rig, &now, y)?);
-        by_skew += influence.by_prev * sight_by_skew(rig, &before, y, twist_prev)?;
-        by_skew += influence.by_now * sight_by_skew(rig, &now, y, twist_now)?;
+        for (from, influence, twist) in [
+            (&before, &influence.by_prev, twist_prev),
+            (&now, &influence.by_now, twist_now),
+        ] {
+            let seen = from.linearise(rig, y)?;
+            by_rig += product(influence, &seen_by_rig(rig, from, y, &seen));
+            by_skew += influence * seen_by_skew(&seen, twist);
+        }
     }
     Some(MotionSensitivity {
         by_rig: Sensitivity::new(by_rig),

@@ -7,7 +7,7 @@
 use super::bundle::TrackedPoint;
 use super::influence::Influence;
 use super::model::Model;
-use super::sight::{self, Sight};
+use super::sight::{Sight, Viewpoint};
 use crate::geometry::product::{product, product_transposed, transposed_scaled};
 use crate::geometry::{StereoRig, se3};
 use nalgebra::{
@@ -161,11 +161,12 @@ impl Reprojection {
         prev_from_now: &Isometry3<f64>,
         points: &[TrackedPoint],
     ) -> Option<f64> {
-        let now_from_prev = prev_from_now.inverse();
+        let before = Viewpoint::unmoved(rig);
+        let now = Viewpoint::new(rig, &prev_from_now.inverse());
         self.tracks.clear();
         let mut cost = 0.0;
         for p in points {
-            let track = TrackEquations::new(rig, &now_from_prev, p)?;
+            let track = TrackEquations::new(rig, [&before, &now], p)?;
             cost += track.cost;
             self.tracks.push(track);
         }
@@ -204,9 +205,10 @@ struct TrackEquations {
 }
 
 impl TrackEquations {
-    fn new(rig: &StereoRig, now_from_prev: &Isometry3<f64>, p: &TrackedPoint) -> Option<Self> {
-        let prev = sight::linearise(rig, &Isometry3::identity(), &p.inverse_depth)?;
-        let now = sight::linearise(rig, now_from_prev, &p.inverse_depth)?;
+    /// `None` where a camera cannot see the point from one of the viewpoints, before and now.
+    fn new(rig: &StereoRig, viewpoints: [&Viewpoint; 2], p: &TrackedPoint) -> Option<Self> {
+        let [before, now] = viewpoints.map(|from| from.linearise(rig, &p.inverse_depth));
+        let (prev, now) = (before?, now?);
         let before = Weighed::new(&p.prev.px, &p.prev.sigma_px, &prev);
         let after = Weighed::new(&p.now.px, &p.now.sigma_px, &now);
         let point_prev: Matrix3x4<f64> = transposed_scaled(&prev.by_point, &before.info);

@@ -6,7 +6,7 @@ use crate::estimation::bundle::TrackedPoint;
 use crate::estimation::sources::Exposure;
 use crate::estimation::{
     self, MeasuredMotion, MotionMeter, MotionTracks, Odometer, Odometry, Settings, Status,
-    TrackedFeature,
+    TrackedFeature, Viewpoint,
 };
 use crate::geometry::StereoRig;
 use crate::matching::MatchError;
@@ -165,13 +165,13 @@ impl TwoFrame {
         reference_from_now: &Isometry3<f64>,
         radius_px: f64,
     ) -> Result<(), MatchError> {
-        let now_from_reference = reference_from_now.inverse();
+        let now = Viewpoint::new(&bench.rig, &reference_from_now.inverse());
         bench.predicted.clear();
         bench.predicted.extend(
             self.reference
                 .inverse_depths
                 .iter()
-                .map(|y| estimation::seen_at(&bench.rig, &now_from_reference, &(*y)?)),
+                .map(|y| now.seen_at(&bench.rig, &(*y)?)),
         );
         bench.temporal_matcher.find(
             self.reference.matched(),

@@ -65,21 +65,27 @@ fn steady(images: &Recording, rate_hz: f64, seconds: f64) -> Outcome {
         .map(|n| f64::from(n) / rate_hz)
         .collect();
     let (arrivals, summary) = follow(images, &times_s, "")?;
-    let mut latencies: Vec<f64> = arrivals.iter().map(|arrival| arrival.latency_ms).collect();
-    latencies.sort_by(f64::total_cmp);
-    let quantile = |share: f64| latencies[(share * (latencies.len() - 1) as f64) as usize];
+    if arrivals.is_empty() {
+        return Err("nothing arrives".into());
+    }
+    let [median, p99, greatest] = latencies_ms(&arrivals);
     println!("| pairs a second | came | handled | latency: median ms | p99 ms | max ms |");
     println!("|---:|---:|---:|---:|---:|---:|");
     println!(
-        "| {rate_hz} | {} | {} | {:.1} | {:.1} | {:.1} |\n\n{} dropped in the queue by the daemon's own count",
+        "| {rate_hz} | {} | {} | {median:.1} | {p99:.1} | {greatest:.1} |\n\n{} dropped in the queue by the \
+         daemon's own count",
         times_s.len(),
-        latencies.len(),
-        quantile(0.5),
-        quantile(0.99),
-        quantile(1.0),
+        arrivals.len(),
         summary["dropped"]
     );
     Ok(())
+}
+
+/// Median, p99 and greatest.
+fn latencies_ms(arrivals: &[Arrival]) -> [f64; 3] {
+    let mut sorted: Vec<f64> = arrivals.iter().map(|arrival| arrival.latency_ms).collect();
+    sorted.sort_by(f64::total_cmp);
+    [0.5, 0.99, 1.0].map(|share| sorted[(share * (sorted.len() - 1) as f64) as usize])
 }
 
 fn overload(images: &Recording, rate_hz: f64, seconds: f64, more: &str) -> Outcome {
@@ -110,24 +116,20 @@ fn overload(images: &Recording, rate_hz: f64, seconds: f64, more: &str) -> Outco
     println!("|---|---:|---:|---:|---:|---:|---:|");
     let mut began_s = f64::NEG_INFINITY;
     for ((name, ..), end_s) in phases.iter().zip(&ends_s) {
-        let inside: Vec<&Arrival> = arrivals
+        let inside: Vec<Arrival> = arrivals
             .iter()
+            .copied()
             .filter(|arrival| (began_s..*end_s).contains(&at_s(arrival)))
             .collect();
         let (Some(first), Some(last)) = (inside.first(), inside.last()) else {
             return Err(format!("{name}: nothing arrives").into());
         };
-        let mut latencies: Vec<f64> = inside.iter().map(|arrival| arrival.latency_ms).collect();
-        latencies.sort_by(f64::total_cmp);
-        let quantile = |share: f64| latencies[(share * (latencies.len() - 1) as f64) as usize];
+        let [median, p99, greatest] = latencies_ms(&inside);
         println!(
-            "| {name} | {} | {} | {:.1} | {:.1} | {:.1} | {:.1} |",
+            "| {name} | {} | {} | {:.1} | {median:.1} | {p99:.1} | {greatest:.1} |",
             last.sequence - first.sequence + 1,
             inside.len(),
-            1e3 * (at_s(last) - at_s(first)) / (inside.len() - 1).max(1) as f64,
-            quantile(0.5),
-            quantile(0.99),
-            quantile(1.0)
+            1e3 * (at_s(last) - at_s(first)) / (inside.len() - 1).max(1) as f64
         );
         began_s = *end_s;
     }

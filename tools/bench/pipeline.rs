@@ -314,28 +314,23 @@ struct Cameras {
     recording: ToAndFro,
     began: Instant,
     period: Duration,
-    next: u32,
 }
 
 impl Cameras {
     /// When a pair is there.
-    fn due(&self, place: u32) -> Instant {
-        self.began + self.period * place
+    fn due(&self, place: u64) -> Instant {
+        self.began + self.period * place as u32
     }
 }
 
 impl PairSource for Cameras {
     fn next_event(&mut self) -> Option<PairEvent> {
-        while Instant::now() >= self.due(self.next + 1) {
+        while Instant::now() >= self.due(self.recording.place() + 1) {
             self.recording.skip();
-            self.next += 1;
         }
+        let due = self.due(self.recording.place());
         let event = self.recording.next_event()?;
-        std::thread::sleep(
-            self.due(self.next)
-                .saturating_duration_since(Instant::now()),
-        );
-        self.next += 1;
+        std::thread::sleep(due.saturating_duration_since(Instant::now()));
         Some(event)
     }
 
@@ -368,7 +363,6 @@ fn paced(rate_hz: f64) {
         recording: recording.source(WARM_UP + PACED),
         began,
         period,
-        next: 0,
     };
     let mut latencies = Vec::with_capacity(PACED as usize);
     let deliver = |delivery: Delivery<'_>| {

@@ -153,18 +153,11 @@ fn gather<const ROWS: usize>(
         let Some(frame) = position(observation.serial) else {
             continue;
         };
-        let (current, linearised) = system.sightline(anchor, frame);
-        let from = linearised.unwrap_or(current);
-        let Some(mut seen) = from.linearise(at.rig, y) else {
+        let line = system.sightline(anchor, frame);
+        let Some(seen) = line.linearise(at.rig, y) else {
             continue;
         };
-        if linearised.is_some() {
-            let Some(px) = current.seen_at(at.rig, y) else {
-                continue;
-            };
-            seen.px = px;
-        }
-        let displaced = displacement::<ROWS>(at, errors, frame, from, y, &seen);
+        let displaced = displacement::<ROWS>(at, errors, frame, line.linearised(), y, &seen);
         let by_warp = at.warp.derivative(&observation.measurement);
         let residual = at.warp.corrected_px(&observation.measurement, &by_warp)
             - seen.px

@@ -15,7 +15,9 @@ use crate::geometry::product::{
 };
 use crate::geometry::{StereoRig, se3};
 use crate::simd::widened;
-use nalgebra::{DMatrix, DVector, Matrix2, Matrix6, SMatrix, SVector, Vector2, Vector4, Vector6};
+use nalgebra::{
+    DMatrix, DVector, Matrix2, Matrix6, SMatrix, SVector, Vector2, Vector3, Vector4, Vector6,
+};
 
 /// Where and how observations are linearised.
 #[derive(Clone, Copy, Debug)]
@@ -68,7 +70,7 @@ pub(super) struct System {
 
 /// How one frame sees the landmarks of one anchor, and what they all say of it.
 #[derive(Clone, Debug)]
-struct Sightline {
+pub(super) struct Sightline {
     current: Viewpoint,
     /// The same where the Jacobians are taken, if elsewhere.
     linearised: Option<Viewpoint>,
@@ -78,6 +80,25 @@ struct Sightline {
     by_warp: SMatrix<f64, 6, WARP>,
     gradient: Vector6<f64>,
     is_used: bool,
+}
+
+impl Sightline {
+    /// Where Jacobians are taken.
+    #[inline(always)]
+    pub(super) fn linearised(&self) -> &Viewpoint {
+        self.linearised.as_ref().unwrap_or(&self.current)
+    }
+
+    /// How the frame sees a point as things stand, with Jacobians as they are taken. `None` where a camera
+    /// cannot.
+    #[inline(always)]
+    pub(super) fn linearise(&self, rig: &StereoRig, y: &Vector3<f64>) -> Option<Sight> {
+        let mut seen = self.linearised().linearise(rig, y)?;
+        if self.linearised.is_some() {
+            seen.px = self.current.seen_at(rig, y)?;
+        }
+        Some(seen)
+    }
 }
 
 /// Unknowns of a landmark: x, y, ρ and its relief.
@@ -142,14 +163,9 @@ impl System {
         &self.crosses[reduced.crosses.clone()]
     }
 
-    /// How a frame sees points of an anchor, which is not later; and the same where Jacobians were taken, if elsewhere.
-    pub(super) fn sightline(
-        &self,
-        anchor: usize,
-        frame: usize,
-    ) -> (&Viewpoint, Option<&Viewpoint>) {
-        let line = &self.sightlines[line_index(anchor, frame)];
-        (&line.current, line.linearised.as_ref())
+    /// How a frame sees the landmarks of an anchor, which is not later.
+    pub(super) fn sightline(&self, anchor: usize, frame: usize) -> &Sightline {
+        &self.sightlines[line_index(anchor, frame)]
     }
 
     /// The adjoint of that.
@@ -312,16 +328,9 @@ fn eliminate_in(
             continue;
         };
         let line = &mut system.sightlines[line_index(anchor, frame)];
-        let from = line.linearised.as_ref().unwrap_or(&line.current);
-        let Some(mut seen) = from.linearise(rig, &landmark.inverse_depth) else {
+        let Some(seen) = line.linearise(rig, &landmark.inverse_depth) else {
             continue;
         };
-        if line.linearised.is_some() {
-            let Some(px) = line.current.seen_at(rig, &landmark.inverse_depth) else {
-                continue;
-            };
-            seen.px = px;
-        }
         sights += 1;
         let by_warp = warp.derivative(&observation.measurement);
         let (info, residual, loss) = weigh(

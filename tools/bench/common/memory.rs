@@ -91,6 +91,11 @@ pub struct ToAndFro {
 }
 
 impl ToAndFro {
+    /// The place of the next pair.
+    pub fn place(&self) -> u64 {
+        self.next
+    }
+
     /// Leaves the next pair out.
     pub fn skip(&mut self) {
         self.next += 1;
