@@ -16,8 +16,9 @@
 //!
 //! The rows of the integral image are first combined with the filter's vertical weights, then the
 //! columns of that one row with the horizontal ones: ten look-ups and ten more for a determinant
-//! instead of thirty-two, every one of them along contiguous memory. Up to the last
-//! multiplications all is in integers, so no order of summation can change a bit.
+//! instead of thirty-two, every one of them along contiguous memory. Where samples are steps apart,
+//! only those columns are combined that share their remainder with one that is looked up. Up to the
+//! last multiplications all is in integers, so no order of summation can change a bit.
 
 use super::integral::{IntegralImage, SortedColumns};
 use crate::simd::widened;
@@ -42,23 +43,33 @@ pub(super) struct Filter {
     per_mixed_area: f32,
 }
 
-/// The working memory of [`Filter::respond`]: one row of integral rows combined with the vertical
-/// weights of D_xx, D_yy and D_xy.
+/// The ninths of a filter's side at which D_xx, D_yy and D_xy look up columns.
+const XX: [usize; 4] = [0, 3, 6, 9];
+const YY: [usize; 2] = [2, 7];
+const XY: [usize; 4] = [1, 4, 5, 8];
+
+/// Stretches of combined rows at most: one for each column that is looked up.
+const MOST_STRETCHES: usize = 10;
+
+/// The working memory of [`Filter::respond`]: stretches of integral rows, combined with the vertical
+/// weights of D_xx, D_yy or D_xy.
 #[derive(Debug, Default)]
-pub(super) struct Combined([Vec<i32>; 3]);
+pub(super) struct Combined(Vec<i32>);
 
 impl Combined {
-    /// Makes room for rows of `len` sums.
-    fn reserve(&mut self, len: usize) {
-        for row in self.0.iter_mut().filter(|row| row.len() < len) {
-            row.resize(len, 0);
+    /// Stretches of `len` sums, as many as a filter needs at most.
+    fn stretches(&mut self, len: usize) -> &mut [i32] {
+        let all = MOST_STRETCHES * len;
+        if self.0.len() < all {
+            self.0.resize(all, 0);
         }
+        &mut self.0[..all]
     }
 
     /// Elements held.
     #[cfg(test)]
     pub(super) fn capacity(&self) -> usize {
-        self.0.iter().map(Vec::capacity).sum()
+        self.0.capacity()
     }
 }
 
@@ -120,21 +131,15 @@ impl Filter {
         debug_assert_eq!(columns.step(), self.step_px);
         let top = (row - self.margin()) * self.step_px;
         let left = (column - self.margin()) * self.step_px;
-        let mut rows = [[].as_slice(); 10];
-        let mut places = [0; 10];
-        for (n, &ninth_px) in self.ninth_px.iter().enumerate() {
-            rows[n] = columns.row(integral, top + ninth_px);
-            places[n] = columns.place(left + ninth_px);
-        }
-        if self.step_px == 1 {
-            // Nothing beyond the filters around the samples.
-            places = self.ninth_px;
-            for row in &mut rows {
-                *row = &row[left..][..out.len() + self.size_px];
-            }
-        }
-        combined.reserve(rows[0].len());
-        respond(self, &rows, places, &mut combined.0, out);
+        let rows = self
+            .ninth_px
+            .map(|ninth_px| columns.row(integral, top + ninth_px));
+        // A column is every `step_px`-th of those that it shares its remainder with.
+        let starts = self
+            .ninth_px
+            .map(|ninth_px| columns.place(left + ninth_px % self.step_px));
+        let len = out.len() + self.taps;
+        respond(self, &rows, &starts, combined.stretches(len), out);
     }
 
     /// The determinant at sample `(row, column)`, to the last bit what [`Self::respond`] gives.
@@ -173,13 +178,13 @@ impl Filter {
 }
 
 widened! {
-    /// Determinants from the ten integral rows at a filter's ninths and the places of the columns at
-    /// them.
+    /// Determinants from the ten integral rows at a filter's ninths, and where in these the columns begin
+    /// that share their remainder with each ninth.
     fn respond = respond_narrow, (
         filter: &Filter,
         rows: &[&[i32]; 10],
-        places: [usize; 10],
-        combined: &mut [Vec<i32>; 3],
+        starts: &[usize; 10],
+        stretches: &mut [i32],
         out: &mut [f32],
     )
 }
@@ -188,42 +193,91 @@ widened! {
 fn respond_narrow(
     filter: &Filter,
     rows: &[&[i32]; 10],
-    places: [usize; 10],
-    combined: &mut [Vec<i32>; 3],
+    starts: &[usize; 10],
+    stretches: &mut [i32],
     out: &mut [f32],
 ) {
-    let len = rows[0].len();
-    let [xx, yy, xy] = combined;
-    combine(rows, &mut xx[..len], &mut yy[..len], &mut xy[..len]);
-    weigh(filter, [xx, yy, xy], places, out);
+    let len = out.len() + filter.taps;
+    let mut room = Room {
+        filter,
+        starts,
+        len,
+        stretches,
+        used: 0,
+        places: [0; 10],
+    };
+    for n in 0..XX.len() {
+        if let Some((start, sums)) = room.place(&XX, n) {
+            let row = |n: usize| &rows[n][start..][..len];
+            let (r2, r7) = (row(2), row(7));
+            for x in 0..len {
+                sums[x] = r7[x].wrapping_sub(r2[x]);
+            }
+        }
+    }
+    for n in 0..YY.len() {
+        if let Some((start, sums)) = room.place(&YY, n) {
+            let row = |n: usize| &rows[n][start..][..len];
+            let (r0, r3, r6, r9) = (row(0), row(3), row(6), row(9));
+            for x in 0..len {
+                sums[x] = second(r0[x], r3[x], r6[x], r9[x]);
+            }
+        }
+    }
+    for n in 0..XY.len() {
+        if let Some((start, sums)) = room.place(&XY, n) {
+            let row = |n: usize| &rows[n][start..][..len];
+            let (r1, r4, r5, r8) = (row(1), row(4), row(5), row(8));
+            for x in 0..len {
+                sums[x] = mixed(r1[x], r4[x], r5[x], r8[x]);
+            }
+        }
+    }
+    let Room {
+        stretches, places, ..
+    } = room;
+    weigh(filter, stretches, &places, out);
 }
 
-/// Combines the rows with the vertical weights of D_xx, D_yy and D_xy.
-#[inline(always)]
-fn combine(rows: &[&[i32]; 10], xx: &mut [i32], yy: &mut [i32], xy: &mut [i32]) {
-    let len = xx.len();
-    let (yy, xy) = (&mut yy[..len], &mut xy[..len]);
-    let [r0, r1, r2, r3, r4, r5, r6, r7, r8, r9] = *rows;
-    let (r0, r1, r2, r3, r4) = (&r0[..len], &r1[..len], &r2[..len], &r3[..len], &r4[..len]);
-    let (r5, r6, r7, r8, r9) = (&r5[..len], &r6[..len], &r7[..len], &r8[..len], &r9[..len]);
-    for x in 0..len {
-        xx[x] = r7[x].wrapping_sub(r2[x]);
-        yy[x] = second(r0[x], r3[x], r6[x], r9[x]);
-        xy[x] = mixed(r1[x], r4[x], r5[x], r8[x]);
+/// Stretches of combined rows, one after the other, the last ones free as yet.
+struct Room<'a> {
+    filter: &'a Filter,
+    starts: &'a [usize; 10],
+    len: usize,
+    stretches: &'a mut [i32],
+    used: usize,
+    /// Where the column of each ninth stands in the stretches.
+    places: [usize; 10],
+}
+
+impl Room<'_> {
+    /// Gives the column at the `n`-th of some ninths, for which rows are combined alike, its place: in the
+    /// stretch of an earlier one with the same remainder, or in a new one, which is then to be filled from where
+    /// it begins in the rows.
+    #[inline(always)]
+    fn place(&mut self, ninths: &[usize], n: usize) -> Option<(usize, &mut [i32])> {
+        let steps = |ninth: usize| self.filter.ninth_px[ninth] / self.filter.step_px;
+        let start = self.starts[ninths[n]];
+        let like = ninths[..n].iter().find(|&&m| self.starts[m] == start);
+        if let Some(&m) = like {
+            self.places[ninths[n]] = self.places[m] - steps(m) + steps(ninths[n]);
+            return None;
+        }
+        let stretch = self.used;
+        self.places[ninths[n]] = stretch + steps(ninths[n]);
+        self.used += self.len;
+        Some((start, &mut self.stretches[stretch..][..self.len]))
     }
 }
 
 /// Determinants from the combined rows.
 #[inline(always)]
-fn weigh(filter: &Filter, combined: [&[i32]; 3], places: [usize; 10], out: &mut [f32]) {
+fn weigh(filter: &Filter, stretches: &[i32], places: &[usize; 10], out: &mut [f32]) {
     let len = out.len();
-    let [xx, yy, xy] = combined;
-    let [p0, p1, p2, p3, p4, p5, p6, p7, p8, p9] = places;
-    let (x0, x3) = (&xx[p0..][..len], &xx[p3..][..len]);
-    let (x6, x9) = (&xx[p6..][..len], &xx[p9..][..len]);
-    let (y2, y7) = (&yy[p2..][..len], &yy[p7..][..len]);
-    let (m1, m4) = (&xy[p1..][..len], &xy[p4..][..len]);
-    let (m5, m8) = (&xy[p5..][..len], &xy[p8..][..len]);
+    let column = |n: usize| &stretches[places[n]..][..len];
+    let (x0, x3, x6, x9) = (column(0), column(3), column(6), column(9));
+    let (y2, y7) = (column(2), column(7));
+    let (m1, m4, m5, m8) = (column(1), column(4), column(5), column(8));
     for j in 0..len {
         let xx = second(x0[j], x3[j], x6[j], x9[j]);
         let yy = y7[j].wrapping_sub(y2[j]);
@@ -344,9 +398,9 @@ mod tests {
             let rows = filter.ninth_px.map(|y| integral.row(y));
             let samples = filter.samples(&integral, filter.margin());
             let (mut wide, mut narrow) = (vec![0.0; samples], vec![1.0; samples]);
-            let mut combined = [(); 3].map(|()| vec![0; 302]);
-            respond(&filter, &rows, filter.ninth_px, &mut combined, &mut wide);
-            respond_narrow(&filter, &rows, filter.ninth_px, &mut combined, &mut narrow);
+            let mut stretches = vec![0; MOST_STRETCHES * 302];
+            respond(&filter, &rows, &[0; 10], &mut stretches, &mut wide);
+            respond_narrow(&filter, &rows, &[0; 10], &mut stretches, &mut narrow);
             assert_eq!(wide, narrow);
         }
     }

@@ -8,7 +8,7 @@
 
 use crate::geometry::definite;
 use crate::image::GrayImage;
-use crate::simd::widened;
+use crate::simd::{round_i32, widened};
 use nalgebra::{Matrix2, Matrix4, Vector2, Vector4};
 
 /// Half the side of a patch, samples.
@@ -28,6 +28,8 @@ const WIDE_SIDE: usize = SIDE.next_multiple_of(LANES);
 const RIM_SIDE: usize = SIDE + 2;
 /// Samples of a template with its rim.
 const RIM_AREA: usize = RIM_SIDE * RIM_SIDE;
+/// Floats that hold them and what whole registers read behind the last.
+const RIM_ROOM: usize = (RIM_AREA + WIDE_SIDE - SIDE).next_multiple_of(LANES);
 /// Room that a patch needs around its centre in the target, px of the level.
 const MARGIN: f32 = HALF as f32 + 1.0;
 
@@ -120,25 +122,34 @@ impl Template {
     }
 
     #[inline(always)]
-    fn from_samples(wide: &[f32; RIM_AREA], surface: &Surface) -> Option<Self> {
+    fn from_samples(wide: &[f32; RIM_ROOM], surface: &Surface) -> Option<Self> {
         let mut values = [0.0; ROOM];
         let mut by = [[0.0; ROOM]; 4];
         let lever = surface.lever.map(|v| v as f32);
         let spread = surface.spread.map(|v| v as f32);
+        let across: [f32; WIDE_SIDE] = std::array::from_fn(|column| column as f32 - HALF as f32);
         for row in 0..SIDE {
-            for column in 0..SIDE {
-                let at = (row + 1) * RIM_SIDE + column + 1;
-                let i = row * SIDE + column;
-                values[i] = wide[at];
-                let by_x = 0.5 * (wide[at + 1] - wide[at - 1]);
-                let by_y = 0.5 * (wide[at + RIM_SIDE] - wide[at - RIM_SIDE]);
-                let (x, y) = (column as f32 - HALF as f32, row as f32 - HALF as f32);
+            // Whole registers: what is too much, the next row writes over.
+            let line =
+                |down: usize, right: usize| &wide[(row + down) * RIM_SIDE + right..][..WIDE_SIDE];
+            let (here, above, below) = (line(1, 1), line(0, 1), line(2, 1));
+            let (left, right) = (line(1, 0), line(1, 2));
+            values[row * SIDE..][..WIDE_SIDE].copy_from_slice(here);
+            let [by_0, by_1, by_2, by_3] =
+                by.each_mut().map(|by| &mut by[row * SIDE..][..WIDE_SIDE]);
+            let y = row as f32 - HALF as f32;
+            for i in 0..WIDE_SIDE {
+                let by_x = 0.5 * (right[i] - left[i]);
+                let by_y = 0.5 * (below[i] - above[i]);
                 let along = -(by_x * lever.x + by_y * lever.y);
-                by[0][i] = by_x;
-                by[1][i] = by_y;
-                by[2][i] = along * (spread[(0, 0)] * x + spread[(0, 1)] * y);
-                by[3][i] = along * (spread[(1, 0)] * x + spread[(1, 1)] * y);
+                by_0[i] = by_x;
+                by_1[i] = by_y;
+                by_2[i] = along * (spread[(0, 0)] * across[i] + spread[(0, 1)] * y);
+                by_3[i] = along * (spread[(1, 0)] * across[i] + spread[(1, 1)] * y);
             }
+        }
+        for samples in by.iter_mut().chain([&mut values]) {
+            samples[AREA..].fill(0.0);
         }
         centre_on_zero(&mut values);
         let energy = dot(&values, &values);
@@ -244,15 +255,16 @@ fn template_in(
     if !holds(image, centre, &extent) {
         return None;
     }
-    let (mut x, mut y) = ([0.0; RIM_AREA], [0.0; RIM_AREA]);
+    let (mut x, mut y) = ([0.0; RIM_ROOM], [0.0; RIM_ROOM]);
     for row in 0..RIM_SIDE {
         let v = row as f32 - reach;
-        for column in 0..RIM_SIDE {
+        // Whole registers: what is too much, the next row writes over.
+        let [x, y] = [&mut x, &mut y].map(|line| &mut line[row * RIM_SIDE..][..WIDE_SIDE]);
+        for column in 0..WIDE_SIDE {
             let u = column as f32 - reach;
             let nearness = 1.0 - (warp.depth.x * u + warp.depth.y * v);
-            let i = row * RIM_SIDE + column;
-            x[i] = centre.x + (linear[(0, 0)] * u + linear[(0, 1)] * v) / nearness;
-            y[i] = centre.y + (linear[(1, 0)] * u + linear[(1, 1)] * v) / nearness;
+            x[column] = centre.x + (linear[(0, 0)] * u + linear[(0, 1)] * v) / nearness;
+            y[column] = centre.y + (linear[(1, 0)] * u + linear[(1, 1)] * v) / nearness;
         }
     }
     Template::from_samples(&sample(image, &x, &y), surface)
@@ -273,19 +285,26 @@ fn align_in(
             return None;
         }
         sample_square(image, &at, &mut seen);
-        centre_on_zero(&mut seen);
+        // Brightness and contrast leave no trace: the values have mean zero, and the derivatives are at right
+        // angles to them and to brightness.
         let gain = dot(&seen, &template.values) / template.energy;
         if gain <= 0.1 {
             return None;
         }
-        let energy = dot(&seen, &seen);
-        for (s, v) in seen.iter_mut().zip(&template.values) {
-            *s = *s / gain - v;
-        }
-        let gradient = Vector4::from(template.by.each_ref().map(|by| f64::from(dot(by, &seen))));
+        let [by_x, by_y, by_slope_x, by_slope_y] = &template.by;
+        let gradient = Vector4::new(
+            f64::from(dot(by_x, &seen)),
+            f64::from(dot(by_y, &seen)),
+            f64::from(dot(by_slope_x, &seen)),
+            f64::from(dot(by_slope_y, &seen)),
+        ) / f64::from(gain);
         let step = inverse * (gradient + template.known.1 * USUAL_VARIANCE);
         if step.xy().amax() < MIN_STEP {
-            let correlation = gain * (template.energy / energy).sqrt();
+            centre_on_zero(&mut seen);
+            let correlation = gain * (template.energy / dot(&seen, &seen)).sqrt();
+            for (s, v) in seen.iter_mut().zip(&template.values) {
+                *s = *s / gain - v;
+            }
             return template.judge(at, &seen, &gradient, &step, correlation);
         }
         at -= step.xy().map(|v| v as f32);
@@ -302,26 +321,42 @@ fn holds(image: &GrayImage, at: &Vector2<f32>, extent: &Vector2<f32>) -> bool {
         && at.y + extent.y < image.height() as f32 - 1.0
 }
 
-/// Bilinear interpolation at many places, all inside the image.
+/// Bilinear interpolation at many places, all inside the image; zeros behind the last.
 #[inline(always)]
-fn sample(image: &GrayImage, x: &[f32; RIM_AREA], y: &[f32; RIM_AREA]) -> [f32; RIM_AREA] {
+fn sample(image: &GrayImage, x: &[f32; RIM_ROOM], y: &[f32; RIM_ROOM]) -> [f32; RIM_ROOM] {
     let (width, pixels) = (image.width() as usize, image.pixels());
-    // Pixels lie anywhere, arithmetic can be done side by side.
-    let mut corners = [[0_u8; RIM_AREA]; 4];
-    for i in 0..RIM_AREA {
-        let first = y[i] as u32 as usize * width + x[i] as u32 as usize;
-        [corners[0][i], corners[1][i]] = [pixels[first], pixels[first + 1]];
-        [corners[2][i], corners[3][i]] = [pixels[first + width], pixels[first + width + 1]];
+    let (mut right, mut low) = ([0.0; RIM_ROOM], [0.0; RIM_ROOM]);
+    let mut places = [0_u32; RIM_ROOM];
+    for i in 0..RIM_ROOM {
+        let (column, row) = (floor(x[i]), floor(y[i]));
+        (right[i], low[i]) = (x[i] - column as f32, y[i] - row as f32);
+        places[i] = (row * width as i32 + column) as u32;
     }
-    let mut samples = [0.0; RIM_AREA];
+    // Pixels lie anywhere, arithmetic can be done side by side. Two look-ups for the four around a place:
+    // of equal length, so that one look at the place does for both.
+    let last = pixels.len().saturating_sub(width);
+    let (above, below) = (&pixels[..last], &pixels[pixels.len() - last..]);
+    let mut quads = [0_u32; RIM_ROOM];
     for i in 0..RIM_AREA {
-        let (fx, fy) = (x[i] - x[i].trunc(), y[i] - y[i].trunc());
-        let corner = |n: usize| f32::from(corners[n][i]);
-        let upper = corner(0) * (1.0 - fx) + corner(1) * fx;
-        let lower = corner(2) * (1.0 - fx) + corner(3) * fx;
-        samples[i] = upper * (1.0 - fy) + lower * fy;
+        let place = places[i] as usize;
+        let [a, b] = [&above[place..][..2], &below[place..][..2]];
+        quads[i] = u32::from_le_bytes([a[0], a[1], b[0], b[1]]);
+    }
+    let mut samples = [0.0; RIM_ROOM];
+    for i in 0..RIM_ROOM {
+        let corner = |n: u32| ((quads[i] >> (8 * n)) & 0xff) as i32 as f32;
+        let upper = corner(0) * (1.0 - right[i]) + corner(1) * right[i];
+        let lower = corner(2) * (1.0 - right[i]) + corner(3) * right[i];
+        samples[i] = upper * (1.0 - low[i]) + lower * low[i];
     }
     samples
+}
+
+/// The largest integer that is not above `value`, whose magnitude is below 2²².
+#[inline(always)]
+fn floor(value: f32) -> i32 {
+    let nearest = round_i32(value);
+    nearest - i32::from(nearest as f32 > value)
 }
 
 /// The square of pixels around `at`, bilinear: all share their weights. What lies behind the last
@@ -336,29 +371,42 @@ fn sample_square(image: &GrayImage, at: &Vector2<f32>, out: &mut Samples) {
         (1.0 - fx) * fy,
         fx * fy,
     ];
-    let (left, top) = (x as usize - HALF, y as u32 - HALF as u32);
-    let mut above = greys(image, left, top);
+    let width = image.width() as usize;
+    let first = (y as usize - HALF) * width + x as usize - HALF;
+    let mut greys = [[[0.0; WIDE_SIDE]; 2]; SIDE + 1];
+    for (row, greys) in greys.iter_mut().enumerate() {
+        for (right, greys) in greys.iter_mut().enumerate() {
+            let bytes = wide_row(image.pixels(), first + row * width + right);
+            for i in 0..WIDE_SIDE {
+                greys[i] = f32::from(bytes[i]);
+            }
+        }
+    }
     for row in 0..SIDE {
-        let below = greys(image, left, top + 1 + row as u32);
+        let [above, below] = [&greys[row], &greys[row + 1]];
         // Whole registers: what is too much, the next row writes over.
         let out = &mut out[row * SIDE..][..WIDE_SIDE];
         for i in 0..WIDE_SIDE {
-            out[i] = weights[0] * above[i]
-                + weights[1] * above[i + 1]
-                + weights[2] * below[i]
-                + weights[3] * below[i + 1];
+            out[i] = weights[0] * above[0][i]
+                + weights[1] * above[1][i]
+                + weights[2] * below[0][i]
+                + weights[3] * below[1][i];
         }
-        above = below;
     }
     out[AREA..].fill(0.0);
 }
 
-/// The grey values of a row that a row of samples lies between, and zeros.
+/// A row of samples from pixel `first` on, and as many more as whole registers hold; zeros behind the image's
+/// last.
 #[inline(always)]
-fn greys(image: &GrayImage, left: usize, row: u32) -> [f32; WIDE_SIDE + 1] {
-    let mut bytes = [0; WIDE_SIDE + 1];
-    bytes[..=SIDE].copy_from_slice(&image.row(row)[left..][..=SIDE]);
-    bytes.map(f32::from)
+fn wide_row(pixels: &[u8], first: usize) -> [u8; WIDE_SIDE] {
+    let row = &pixels[first..];
+    if let Some(row) = row.first_chunk() {
+        return *row;
+    }
+    let mut padded = [0; WIDE_SIDE];
+    padded[..row.len()].copy_from_slice(row);
+    padded
 }
 
 #[inline(always)]

@@ -2,17 +2,20 @@
 //!
 //! One thread, 1280 × 960 px, for several numbers of features: left–right, then over time near a
 //! prediction and over time far around; best and median of many runs. With OpenCV, FLANN as well.
-//! The checksum tells whether two versions found the same.
+//! Then patches: making them, and aligning them with an image of the same. The checksums tell whether two
+//! versions found the same.
 
 mod common;
 
 use common::Times;
-use nalgebra::{Isometry3, Point3, Vector3, Vector4};
+use nalgebra::{Isometry3, Matrix2, Point3, Vector2, Vector3, Vector4};
 use rand::{RngExt, SeedableRng};
 use rand_xoshiro::Xoshiro256PlusPlus;
 use visod::features::{Features, Keypoint};
 use visod::geometry::{Rectification, StereoRig};
+use visod::image::GrayImage;
 use visod::matching::{MatchedPair, MatcherName, Settings, StereoMatcher, TemporalMatcher};
+use visod::refinement::{Pyramid, Surface, Template, Warp};
 use visod::simulation::thesis_rig;
 
 const WIDTH: f32 = 1280.0;
@@ -36,6 +39,71 @@ fn main() {
         };
         measure("flann", flann, 1000, RUNS / 10);
     }
+    measure_patches();
+}
+
+/// 1,000 patches of an image, and each found in it again from half a pixel beside.
+fn measure_patches() {
+    let mut rng = Xoshiro256PlusPlus::seed_from_u64(2);
+    let (width, height) = (WIDTH as u32, HEIGHT as u32);
+    let noise = (0..width * height).map(|_| rng.random()).collect();
+    let image = GrayImage::from_vec(width, height, noise).unwrap_or_default();
+    let mut pyramid = Pyramid::default();
+    pyramid.fill(&image);
+    let level = pyramid.level(1);
+    let warp = Warp {
+        linear: Matrix2::new(0.98, 0.03, -0.02, 1.02),
+        depth: Vector2::new(0.001, -0.002),
+    };
+    let surface = Surface {
+        lever: Vector2::new(9.0, 0.5),
+        spread: Matrix2::identity(),
+        gap: Vector2::zeros(),
+        information: Matrix2::identity() * 1e5,
+    };
+    let mut place = |length: u32| rng.random_range(20.0..length as f32 - 20.0);
+    let centres: Vec<Vector2<f32>> = (0..1000)
+        .map(|_| Vector2::new(place(level.width()), place(level.height())))
+        .collect();
+    let mut templates = Vec::with_capacity(centres.len());
+    let making =
+        time(RUNS, || {
+            templates.clear();
+            templates.extend(centres.iter().filter_map(|centre| {
+                Some((*centre, Template::new(level, centre, &warp, &surface)?))
+            }));
+        });
+    let mut found = Vec::with_capacity(templates.len());
+    let aligning = time(RUNS, || {
+        found.clear();
+        found.extend(templates.iter().filter_map(|(centre, template)| {
+            template.align(level, &(centre + Vector2::new(0.4, -0.3)), 4.0)
+        }));
+    });
+    let mut checksum = Checksum::new();
+    for aligned in &found {
+        checksum.add(aligned.at.x.to_bits(), aligned.at.y.to_bits());
+        checksum.add(
+            (aligned.cov[(0, 0)] as f32).to_bits(),
+            (aligned.gap.x as f32).to_bits(),
+        );
+    }
+    println!(
+        "\n### Patches: {} of an image, one thread, best (median) ms\n",
+        centres.len()
+    );
+    println!("| made | aligned | made | found | checksum |");
+    println!("|---:|---:|---:|---:|---|");
+    println!(
+        "| {:.2} ({:.2}) | {:.2} ({:.2}) | {} | {} | {:016x} |",
+        making.0,
+        making.1,
+        aligning.0,
+        aligning.1,
+        templates.len(),
+        found.len(),
+        checksum.0
+    );
 }
 
 /// Two stereo pairs and where the earlier one's points should be seen in the later one.
