@@ -23,7 +23,7 @@ mod tests {
     use visod::features::{self, Extractor, Features};
     use visod::geometry::Rectification;
     use visod::image::GrayImage;
-    use visod::matching::{self, MatchedPair, StereoMatcher, TemporalMatcher};
+    use visod::matching::{self, MatchedPair, Partners, StereoMatcher, TemporalMatcher};
     use visod::output::features::FeaturesMessage;
     use visod::output::message::CaptureTime;
     use visod::pipeline::{self, DescribedPair, Method};
@@ -85,6 +85,8 @@ mod tests {
     }
 
     const FRAMES: u64 = 8;
+    /// Keypoints that an image has at most.
+    const BUDGET: usize = 1000;
     /// To and fro four times: every buffer has been as large as any pair makes it.
     const WARM_UP: u64 = 8 * FRAMES;
     const COUNTED: u64 = 4 * FRAMES;
@@ -96,8 +98,10 @@ mod tests {
         let recording = Recording::simulated(small_rig(), FRAMES);
         let described = features_do_not_allocate(&recording);
         matching_does_not_allocate(&recording, &described);
-        the_method_does_not_allocate(&recording, &described);
-        the_pipeline_does_not_allocate(&recording);
+        for partners in [Partners::Features, Partners::Surroundings] {
+            the_method_does_not_allocate(&recording, &described, partners);
+            the_pipeline_does_not_allocate(&recording, partners);
+        }
         recordings_are_read_without_allocating(&recording);
     }
 
@@ -166,17 +170,24 @@ mod tests {
         }
     }
 
-    fn method(recording: &Recording) -> Method {
+    fn method(recording: &Recording, partners: Partners) -> Method {
         let rig = recording.rig.clone();
-        let (matching, estimation) = (Default::default(), memory::estimation());
-        Method::new(rig, matching, estimation)
+        let matching = matching::Settings {
+            partners,
+            ..matching::Settings::default()
+        };
+        Method::new(rig, matching, memory::estimation())
             .expect("side by side")
             .watching_rig(&visod::rig_watch::Settings::default())
     }
 
     /// Matching and estimation as they run.
-    fn the_method_does_not_allocate(recording: &Recording, described: &[[Features; 2]]) {
-        let mut method = method(recording);
+    fn the_method_does_not_allocate(
+        recording: &Recording,
+        described: &[[Features; 2]],
+        partners: Partners,
+    ) {
+        let mut method = method(recording, partners);
         let mut pair = DescribedPair::default();
         let mut tracked = Box::<FeaturesMessage>::default();
         for place in 0..WARM_UP + COUNTED {
@@ -186,7 +197,13 @@ mod tests {
                 (&mut pair.left, left, &images.left),
                 (&mut pair.right, right, &images.right),
             ] {
+                // Room for a budget, as an extractor makes it.
                 side.features.clone_from(features);
+                let count = side.features.len();
+                side.features.keypoints.reserve_exact(BUDGET - count);
+                side.features
+                    .descriptors
+                    .reserve_exact(64 * (BUDGET - count));
                 side.take(image);
             }
             pair.sequence = place;
@@ -204,8 +221,8 @@ mod tests {
     }
 
     /// All stages side by side, and the queues between them.
-    fn the_pipeline_does_not_allocate(recording: &Recording) {
-        let mut method = method(recording);
+    fn the_pipeline_does_not_allocate(recording: &Recording, partners: Partners) {
+        let mut method = method(recording, partners);
         let mut counted = 0;
         let mut rows = 0;
         // Each has had an image: a machine with other work may let one worker do it all for long.

@@ -78,6 +78,7 @@ impl Config {
             ("features.opencv", config.features.opencv.check()),
             ("features", config.features.check()),
             ("matching", config.matching.check()),
+            ("matching", config.check_partners()),
             ("estimation", config.estimation.check()),
             ("rig_watch", config.rig_watch.check()),
             ("pipeline", config.pipeline.check()),
@@ -94,6 +95,21 @@ impl Config {
     }
 }
 
+impl Config {
+    /// Surroundings tell places by whole pixels: the window finds each again to a fraction of one, and what goes from
+    /// pair to pair does not.
+    fn check_partners(&self) -> Result<(), SettingError> {
+        let is_window = self.estimation.method == estimation::Method::Window;
+        if self.matching.partners == matching::Partners::Features || is_window {
+            return Ok(());
+        }
+        Err(SettingError {
+            key: "partners",
+            cause: "\"surroundings\" needs estimation.method = \"window\"".to_owned(),
+        })
+    }
+}
+
 fn check_camera(camera: Option<&capture::settings::CameraSettings>) -> Result<(), SettingError> {
     camera.map_or(Ok(()), capture::settings::CameraSettings::check)
 }
@@ -101,6 +117,17 @@ fn check_camera(camera: Option<&capture::settings::CameraSettings>) -> Result<()
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn surroundings_need_the_window() {
+        let surroundings = "[matching]\npartners = \"surroundings\"\n";
+        assert!(Config::parse(surroundings).is_ok());
+        let bundle = format!("{surroundings}[estimation]\nmethod = \"bundle\"\n");
+        assert_eq!(
+            error_of(&bundle),
+            "configuration:2: matching.partners: \"surroundings\" needs estimation.method = \"window\""
+        );
+    }
 
     fn error_of(text: &str) -> String {
         Config::parse(text)

@@ -86,6 +86,14 @@ impl Rectification {
         self.rectify(&self.right, &self.common_from_right, raw_px)
     }
 
+    /// The raw pixel of the right camera that lies at `rectified_px`: the reverse of [`right`](Self::right).
+    #[must_use]
+    pub fn raw_right(&self, rectified_px: &Vector2<f64>) -> Option<Vector2<f64>> {
+        let ray = Vector3::new(rectified_px.x, rectified_px.y, self.focal_px);
+        let point = self.common_from_right.inverse_transform_vector(&ray);
+        self.right.project(&point.into())
+    }
+
     fn rectify(
         &self,
         camera: &Camera,
@@ -136,6 +144,8 @@ mod tests {
             prop_assert!((left.y - right.y).abs() < 1e-8);
             let depth = (rectification.common_from_left * point.coords).z;
             prop_assert!((left.x - right.x - rectification.disparity_px(depth)).abs() < 1e-8);
+            let raw = rectification.raw_right(&right).expect("in front");
+            prop_assert!((raw - seen.fixed_rows::<2>(2)).norm() < 1e-8);
         }
 
         #[test]

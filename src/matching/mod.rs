@@ -4,8 +4,10 @@
 //! of an earlier pair with one of this pair, and has passed the circle left now – right now – right
 //! before – left before. Everything is found among few candidates: left–right in a narrow band of
 //! rectified rows, over time near the predicted position. No image is resampled. OpenCV's FLANN may
-//! propose the candidates instead, where that was built in; they pass the same gates.
+//! propose the candidates instead, where that was built in; they pass the same gates. Or a left feature's
+//! partner is what the right image shows of its surroundings, and no feature of that image.
 
+mod blocks;
 mod candidates;
 mod descriptor;
 #[cfg(feature = "opencv")]
@@ -13,6 +15,7 @@ pub mod flann;
 mod grid;
 mod pairing;
 mod stereo;
+mod surroundings;
 #[cfg(test)]
 pub(crate) mod synthetic;
 mod temporal;
@@ -21,10 +24,22 @@ mod tests;
 
 pub use candidates::{MatchError, MatcherName};
 pub use stereo::{StereoMatch, StereoMatcher};
+pub use surroundings::SurroundingsMatcher;
 pub use temporal::{MatchedPair, TemporalMatcher, Track};
 
 use crate::settings::SettingError;
 use serde::{Deserialize, Serialize};
+
+/// What of the right image is matched with the left features.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "lowercase")]
+pub enum Partners {
+    /// Features that are found in it.
+    #[default]
+    Features,
+    /// Its pixels: no features are found in it.
+    Surroundings,
+}
 
 /// How features are matched.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,6 +49,10 @@ pub struct Settings {
     /// two nearest descriptors by OpenCV's FLANN where that was built in. Default "guided": FLANN
     /// is slower, and misses what repeats itself elsewhere in the image.
     pub matcher: MatcherName,
+    /// What left features are matched with: "features" of the right image, or, with the window's method,
+    /// "surroundings": what surrounds them is sought in the right image, in which no features are found then.
+    /// Default "features".
+    pub partners: Partners,
     /// Greatest ratio of the best descriptor distance to the second best among the candidates of
     /// one feature. No unit, 0.1 to 1, default 0.85: candidates are few, so that a stricter test
     /// loses good matches without catching more bad ones.
@@ -73,6 +92,7 @@ impl Default for Settings {
     fn default() -> Self {
         Self {
             matcher: MatcherName::default(),
+            partners: Partners::default(),
             max_ratio: 0.85,
             max_distance: 1.0,
             row_band_px: 2.0,

@@ -147,6 +147,9 @@ pub fn run<S: PairSource, E>(
 ) -> Result<(), PipelineError<E>> {
     prepare_thread();
     let under_way = pairs_under_way(source.is_live(), extractors.len());
+    let sides = Sides {
+        right: method.wants_right_features(),
+    };
     source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
     let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);
@@ -160,7 +163,7 @@ pub fn run<S: PairSource, E>(
             let (jobs, done) = (jobs.clone(), done_in.clone());
             std::thread::Builder::new()
                 .name(format!("features-{n}"))
-                .spawn_scoped(scope, move || work(extractor, &jobs, &done))
+                .spawn_scoped(scope, move || work(extractor, sides, &jobs, &done))
                 .map_err(PipelineError::Thread)?;
         }
         std::thread::Builder::new()
@@ -299,8 +302,19 @@ fn feed<S: PairSource>(
     }
 }
 
+/// The sides that features are wanted of, beside the left one.
+#[derive(Clone, Copy)]
+struct Sides {
+    right: bool,
+}
+
 /// Finds features until there are no more images.
-fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<Done>) {
+fn work(
+    mut extractor: Box<dyn Extractor>,
+    sides: Sides,
+    jobs: &Receiver<Job>,
+    done: &Sender<Done>,
+) {
     /// Tells the collector if the worker dies, so that it does not wait for ever.
     struct Alarm<'a>(&'a Sender<Done>);
     impl Drop for Alarm<'_> {
@@ -314,7 +328,11 @@ fn work(mut extractor: Box<dyn Extractor>, jobs: &Receiver<Job>, done: &Sender<D
     prepare_thread();
     while let Ok(mut job) = jobs.recv() {
         let started = Instant::now();
-        let result = extractor.extract(&job.image, &mut job.described.features);
+        let result = if job.side == Side::Left || sides.right {
+            extractor.extract(&job.image, &mut job.described.features)
+        } else {
+            Ok(())
+        };
         job.described.take(&job.image);
         let side = Done::Side {
             took: started.elapsed(),

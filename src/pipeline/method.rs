@@ -16,7 +16,8 @@ use crate::features::{ExtractError, Extractor, Features};
 use crate::geometry::{Rectification, StereoRig};
 use crate::image::{BANDS, GrayImage};
 use crate::matching::{
-    self, MatchError, MatchedPair, StereoMatch, StereoMatcher, TemporalMatcher, Track,
+    self, MatchError, MatchedPair, Partners, StereoMatch, StereoMatcher, SurroundingsMatcher,
+    TemporalMatcher, Track,
 };
 use crate::refinement::{Pyramid, PyramidPair};
 use crate::rig_watch::{self, RigState, RigWatch};
@@ -100,6 +101,7 @@ pub(super) struct Workbench {
     pub(super) matching: matching::Settings,
     pub(super) estimation: estimation::Settings,
     stereo_matcher: StereoMatcher,
+    surroundings: SurroundingsMatcher,
     pub(super) temporal_matcher: TemporalMatcher,
     pub(super) now: Seen,
     pub(super) predicted: Vec<Option<Vector4<f64>>>,
@@ -161,6 +163,7 @@ impl Method {
             errors: RigErrors::of(&rig, &estimation),
             exposure: Exposure::default(),
             rig,
+            surroundings: SurroundingsMatcher::new(matching.clone(), rectification.clone()),
             stereo_matcher: StereoMatcher::new(matching.clone(), rectification),
             temporal_matcher: TemporalMatcher::new(matching.clone()),
             matching,
@@ -194,6 +197,12 @@ impl Method {
     pub fn continuing(mut self, epoch: u32, start: Option<Start>) -> Self {
         self.bench.beginning = (epoch, start);
         self
+    }
+
+    /// Whether features of the right image are wanted.
+    #[must_use]
+    pub fn wants_right_features(&self) -> bool {
+        self.bench.matching.partners == Partners::Features
     }
 
     /// How the rig is, where it is watched.
@@ -266,6 +275,19 @@ impl Method {
 impl Workbench {
     fn match_left_and_right(&mut self) -> Result<(), MatchError> {
         let seen = &mut self.now;
+        if self.matching.partners == Partners::Surroundings {
+            let images = PyramidPair {
+                left: &seen.pair.left.pyramid,
+                right: &seen.pair.right.pyramid,
+            };
+            self.surroundings.find(
+                &seen.pair.left.features,
+                &images,
+                &mut seen.pair.right.features,
+                &mut seen.matches,
+            );
+            return Ok(());
+        }
         self.stereo_matcher.find(
             &seen.pair.left.features,
             &seen.pair.right.features,

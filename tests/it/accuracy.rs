@@ -52,22 +52,64 @@ fn assert_tracked(rows: &[visod::output::row::OdometryRow], pairs: usize) {
     assert_covariances_hold(rows);
 }
 
+/// A configuration under which the right image is searched for the surroundings of left features.
+fn surroundings(folder: &Path) -> PathBuf {
+    let config = folder.join("surroundings.toml");
+    std::fs::write(&config, "[matching]\npartners = \"surroundings\"\n").unwrap();
+    config
+}
+
 #[test]
 fn a_drive_of_kitti_drifts_by_less_than_a_hundredth() {
+    drive_of_kitti(&[]);
+}
+
+#[test]
+fn a_drive_of_kitti_drifts_no_more_without_features_on_the_right() {
+    let folder = tempfile::tempdir().unwrap();
+    let config = surroundings(folder.path());
+    drive_of_kitti(&["--config", config.to_str().unwrap()]);
+}
+
+#[test]
+fn without_features_on_the_right_any_number_of_workers_gives_the_same_bits() {
     let Some(recording) = test_recording("kitti_straight") else {
         return;
     };
-    let run = replay_quietly(&recording, &[]);
+    let folder = tempfile::tempdir().unwrap();
+    let csv = |workers: u32| {
+        let config = surroundings(folder.path());
+        let mut text = std::fs::read_to_string(&config).unwrap();
+        text += &format!("[pipeline]\nworkers = {workers}\n");
+        std::fs::write(&config, text).unwrap();
+        let run = replay_quietly(&recording, &["--config", config.to_str().unwrap()]);
+        let estimates = |row: &visod::output::row::OdometryRow| {
+            (
+                row.odom_from_camera,
+                row.cov_pose,
+                row.counts.keypoints_right,
+            )
+        };
+        run.rows.iter().map(estimates).collect::<Vec<_>>()
+    };
+    assert_eq!(csv(1), csv(2));
+}
+
+fn drive_of_kitti(more: &[&str]) {
+    let Some(recording) = test_recording("kitti_straight") else {
+        return;
+    };
+    let run = replay_quietly(&recording, more);
     assert_tracked(&run.rows, 51);
     let evaluation = evaluate(&recording.join("poses.txt"), &run.csv);
     assert_eq!(evaluation["errors"], Value::Array(Vec::new()));
     let all = &evaluation["segments"]["all"];
     assert_eq!(all["segments"].as_u64(), Some(128));
     let percent = all["translation_percent"].as_f64().unwrap();
-    // Measured: 0.633 %. Other visual odometries have 0.66 to 1.4 % on these frames.
+    // Measured: 0.627 and 0.624 %. Other visual odometries have 0.66 to 1.4 % on these frames.
     assert!(percent < 0.65, "{percent} %");
     let turn = all["rotation_deg_per_m"].as_f64().unwrap();
-    assert!(turn < 0.012, "{turn} °/m"); // measured: 0.0108
+    assert!(turn < 0.012, "{turn} °/m"); // measured: 0.0108 both
 }
 
 #[test]
@@ -85,6 +127,7 @@ fn a_camera_that_stands_still_stays_where_it_is() {
 
 #[test]
 fn a_rendered_drive_in_full_size_ends_near_the_truth() {
+    // With features on the right, and without.
     let folder = tempfile::tempdir().unwrap();
     let recording = folder.path().join("drive");
     let output = visod()
@@ -105,15 +148,18 @@ fn a_rendered_drive_in_full_size_ends_near_the_truth() {
     let simulated: Value = serde_json::from_slice(&output.stdout).unwrap();
     let path_m = simulated["length_m"].as_f64().unwrap();
     assert_eq!(simulated["width_px"].as_u64(), Some(1280));
-    let run = replay_quietly(&recording, &[]);
-    assert_tracked(&run.rows, 20);
-    let errors_m = errors_m(&run.rows, &true_poses(&recording));
-    let end = errors_m.last().unwrap() / path_m;
-    assert!(
-        end < 0.003,
-        "{:.3} % of {path_m} m: {errors_m:?}",
-        end * 100.0
-    );
+    let config = surroundings(folder.path());
+    for more in [&[][..], &["--config", config.to_str().unwrap()]] {
+        let run = replay_quietly(&recording, more);
+        assert_tracked(&run.rows, 20);
+        let errors_m = errors_m(&run.rows, &true_poses(&recording));
+        let end = errors_m.last().unwrap() / path_m;
+        assert!(
+            end < 0.003,
+            "{:.3} % of {path_m} m: {errors_m:?}",
+            end * 100.0
+        );
+    }
 }
 
 #[test]

@@ -16,6 +16,7 @@ use std::time::{Duration, Instant};
 use visod::capture::{PairEvent, PairSource, StereoPair};
 use visod::features::{self, Extractor};
 use visod::geometry::StereoRig;
+use visod::matching::{self, Partners};
 use visod::pipeline::{self, Delivery, DescribedPair, Method, StageLatencies};
 use visod::simulation::{small_rig, thesis_rig};
 
@@ -37,13 +38,44 @@ fn main() {
         Some("paced") => paced(number.unwrap_or(40.0)),
         Some("profile") => {
             let recording = Recording::simulated(thesis_rig(), FRAMES);
-            let run = Run::of(&recording, number.unwrap_or(300.0) as u64, 1000, 2);
+            let run = Run::of(&recording, number.unwrap_or(300.0) as u64, USUAL, 2);
             println!("{:.2} ms of processor time a pair", run.cpu_ms);
         }
         _ => {
             throughput();
             division();
             paced(40.0);
+        }
+    }
+}
+
+/// How many keypoints an image has, and what of the right image they are matched with.
+#[derive(Clone, Copy)]
+struct Keypoints {
+    budget: usize,
+    partners: Partners,
+}
+
+/// As many as the targets are for, in both images.
+const USUAL: Keypoints = Keypoints {
+    budget: 1000,
+    partners: Partners::Features,
+};
+
+impl Keypoints {
+    fn lean(budget: usize) -> Self {
+        Self {
+            budget,
+            partners: Partners::Surroundings,
+        }
+    }
+}
+
+impl std::fmt::Display for Keypoints {
+    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        match self.partners {
+            Partners::Features => write!(f, "{}", self.budget),
+            Partners::Surroundings => write!(f, "{} on the left", self.budget),
         }
     }
 }
@@ -57,21 +89,24 @@ struct Run {
 }
 
 impl Run {
-    fn of(recording: &Recording, pairs: u64, budget: usize, workers: usize) -> Self {
+    fn of(recording: &Recording, pairs: u64, keypoints: Keypoints, workers: usize) -> Self {
         let source = recording.source(WARM_UP + pairs);
-        Self::over(&recording.rig, source, budget, workers, |_| ())
+        Self::over(&recording.rig, source, keypoints, workers, |_| ())
     }
 
     /// Carries a whole source through the pipeline; `see` is told of each counted pair.
     fn over(
         rig: &StereoRig,
         source: impl PairSource,
-        budget: usize,
+        Keypoints { budget, partners }: Keypoints,
         workers: usize,
         mut see: impl FnMut(usize),
     ) -> Self {
-        let (matching, estimation) = (Default::default(), estimation());
-        let Some(mut method) = Method::new(rig.clone(), matching, estimation) else {
+        let matching = matching::Settings {
+            partners,
+            ..matching::Settings::default()
+        };
+        let Some(mut method) = Method::new(rig.clone(), matching, estimation()) else {
             unreachable!("the cameras stand side by side")
         };
         let extractors = (0..workers).map(|_| extractor(budget)).collect();
@@ -116,11 +151,11 @@ fn extractor(budget: usize) -> Box<dyn Extractor> {
 }
 
 fn throughput() {
-    println!("\n### Pipeline: whole pairs from memory, 1,000 keypoints an image\n");
+    println!("\n### Pipeline: whole pairs from memory\n");
     println!(
-        "| recording | workers | wall ms a pair | processor ms a pair | features | matching | estimation | estimation's share | resident MB |"
+        "| recording | keypoints | workers | wall ms a pair | processor ms a pair | features | matching | estimation | estimation's share | resident MB |"
     );
-    println!("|---|---:|---:|---:|---:|---:|---:|---:|---:|");
+    println!("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|");
     let simulated = Recording::simulated(thesis_rig(), FRAMES);
     let kitti = Recording::recorded("kitti_straight", 20);
     let recordings = [("1280 × 960", Some(simulated)), ("KITTI", kitti)];
@@ -129,9 +164,14 @@ fn throughput() {
             println!("| {name} | skipped: the recording is not there |");
             continue;
         };
-        for workers in [2, 1] {
+        for (keypoints, workers) in [
+            (USUAL, 2),
+            (USUAL, 1),
+            (Keypoints::lean(1000), 2),
+            (Keypoints::lean(500), 2),
+        ] {
             // The least disturbed of three.
-            let runs = [(); 3].map(|()| Run::of(&recording, PAIRS, 1000, workers));
+            let runs = [(); 3].map(|()| Run::of(&recording, PAIRS, keypoints, workers));
             let Some(run) = runs.iter().min_by(|a, b| a.cpu_ms.total_cmp(&b.cpu_ms)) else {
                 continue;
             };
@@ -142,7 +182,7 @@ fn throughput() {
             let median = |stage: fn(&StageLatencies) -> Duration| run.quantile_ms(stage, 0.5);
             let estimation_ms = median(|l| l.estimation);
             println!(
-                "| {name} | {workers} | {wall_ms:.2} | {:.2} | {:.2} | {:.2} | {estimation_ms:.2} | {:.0} % | {:.0} |",
+                "| {name} | {keypoints} | {workers} | {wall_ms:.2} | {:.2} | {:.2} | {:.2} | {estimation_ms:.2} | {:.0} % | {:.0} |",
                 run.cpu_ms,
                 median(|l| l.features),
                 median(|l| l.matching),
@@ -247,7 +287,8 @@ fn growth() {
         }
     }
     for (name, recording, budget) in cases {
-        let runs = [(); 3].map(|()| Run::of(&recording, 40, budget, 1));
+        let keypoints = Keypoints { budget, ..USUAL };
+        let runs = [(); 3].map(|()| Run::of(&recording, 40, keypoints, 1));
         let best = |stage: fn(&StageLatencies) -> Duration| {
             let times = runs.iter().map(|run| run.quantile_ms(stage, 0.1));
             times.fold(f64::INFINITY, f64::min)
@@ -312,7 +353,7 @@ fn endurance(pairs: u64) {
         }
     };
     let source = recording.source(WARM_UP + pairs);
-    Run::over(&recording.rig, source, 1000, 2, see);
+    Run::over(&recording.rig, source, USUAL, 2, see);
 }
 
 /// Two cameras that show a recording at a rate, whether or not anybody is ready: of two pairs that wait the older
