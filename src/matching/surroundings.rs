@@ -155,8 +155,13 @@ impl SurroundingsMatcher {
         while disparity_px < largest_px {
             disparity_px = (disparity_px + STRETCH_PX).min(largest_px);
             let to = middle(disparity_px);
+            let before = self.line.len();
             if let (Some(from), Some(to)) = (from, to) {
                 take_stretch(image, from, to, &mut self.line);
+            }
+            if 0 < before && self.line.len() == before {
+                // It has left the image.
+                break;
             }
             from = to;
         }
