@@ -93,9 +93,7 @@ impl Config {
         }
         Ok(config)
     }
-}
 
-impl Config {
     /// Surroundings tell places by whole pixels: the window finds each again to a fraction of one, and what goes from
     /// pair to pair does not.
     fn check_partners(&self) -> Result<(), SettingError> {
@@ -118,6 +116,12 @@ fn check_camera(camera: Option<&capture::settings::CameraSettings>) -> Result<()
 mod tests {
     use super::*;
 
+    fn error_of(text: &str) -> String {
+        Config::parse(text)
+            .expect_err("must be refused")
+            .to_string()
+    }
+
     #[test]
     fn surroundings_need_the_window() {
         let surroundings = "[matching]\npartners = \"surroundings\"\n";
@@ -127,12 +131,6 @@ mod tests {
             error_of(&bundle),
             "configuration:2: matching.partners: \"surroundings\" needs estimation.method = \"window\""
         );
-    }
-
-    fn error_of(text: &str) -> String {
-        Config::parse(text)
-            .expect_err("must be refused")
-            .to_string()
     }
 
     #[test]

@@ -43,13 +43,14 @@ pub(super) struct Filter {
     per_mixed_area: f32,
 }
 
-/// The ninths of a filter's side at which D_xx, D_yy and D_xy look up columns.
+/// The ninths of a filter's side at which D_xx, D_yy and D_xy look up columns; rows are looked up at those of D_yy, D_xx
+/// and D_xy.
 const XX: [usize; 4] = [0, 3, 6, 9];
 const YY: [usize; 2] = [2, 7];
 const XY: [usize; 4] = [1, 4, 5, 8];
 
 /// Stretches of combined rows at most: one for each column that is looked up.
-const MOST_STRETCHES: usize = 10;
+const MOST_STRETCHES: usize = XX.len() + YY.len() + XY.len();
 
 /// The working memory of [`Filter::respond`]: stretches of integral rows, combined with the vertical
 /// weights of D_xx, D_yy or D_xy.
@@ -215,24 +216,8 @@ fn respond_narrow(
             }
         }
     }
-    for n in 0..YY.len() {
-        if let Some((start, sums)) = room.place(&YY, n) {
-            let row = |n: usize| &rows[n][start..][..len];
-            let (r0, r3, r6, r9) = (row(0), row(3), row(6), row(9));
-            for x in 0..len {
-                sums[x] = second(r0[x], r3[x], r6[x], r9[x]);
-            }
-        }
-    }
-    for n in 0..XY.len() {
-        if let Some((start, sums)) = room.place(&XY, n) {
-            let row = |n: usize| &rows[n][start..][..len];
-            let (r1, r4, r5, r8) = (row(1), row(4), row(5), row(8));
-            for x in 0..len {
-                sums[x] = mixed(r1[x], r4[x], r5[x], r8[x]);
-            }
-        }
-    }
+    room.combine_four(rows, XX, &YY, second);
+    room.combine_four(rows, XY, &XY, mixed);
     let Room {
         stretches, places, ..
     } = room;
@@ -267,6 +252,27 @@ impl Room<'_> {
         self.places[ninths[n]] = stretch + steps(ninths[n]);
         self.used += self.len;
         Some((start, &mut self.stretches[stretch..][..self.len]))
+    }
+
+    /// Combines the rows at four ninths for the columns at others.
+    #[inline(always)]
+    fn combine_four(
+        &mut self,
+        rows: &[&[i32]; 10],
+        [a, b, c, d]: [usize; 4],
+        columns: &[usize],
+        combined: impl Fn(i32, i32, i32, i32) -> i32,
+    ) {
+        let len = self.len;
+        for n in 0..columns.len() {
+            if let Some((start, sums)) = self.place(columns, n) {
+                let row = |n: usize| &rows[n][start..][..len];
+                let (a, b, c, d) = (row(a), row(b), row(c), row(d));
+                for x in 0..len {
+                    sums[x] = combined(a[x], b[x], c[x], d[x]);
+                }
+            }
+        }
     }
 }
 

@@ -13,7 +13,7 @@ use crate::simd::widened;
 use nalgebra::Vector2;
 
 /// Pixels across a block.
-pub(super) const SIDE: usize = 8;
+const SIDE: usize = 8;
 /// Pixels of a block.
 const AREA: f32 = (SIDE * SIDE) as f32;
 /// Weakest contrast of a block: the sum of its squared deviations, grey levels².
@@ -72,7 +72,7 @@ impl Block {
             *row = *image.pixels()[first + y * image.width() as usize..].first_chunk()?;
         }
         let [sum, square] = products(&pixels, image, first, |_, pixel| [1, pixel]);
-        let energy = square - sum * sum / AREA;
+        let energy = energy(sum, square);
         (energy >= LEAST_ENERGY).then(|| Self {
             pixels,
             mean: sum / AREA,
@@ -154,7 +154,7 @@ fn sum_blocks_narrow(sums: &[i32], squares: &[i32], out: &mut [f32], per_root: &
             square += squares[x + column];
         }
         let sum = sum as f32;
-        let energy = square as f32 - sum * sum / AREA;
+        let energy = energy(sum, square as f32);
         out[x] = sum;
         per_root[x] = if energy >= LEAST_ENERGY {
             1.0 / energy.sqrt()
@@ -203,7 +203,7 @@ fn best_within_narrow(
             let [product, sum, square] = products(&block.pixels, image, first, |other, pixel| {
                 [other, 1, pixel]
             });
-            let energy = (square - sum * sum / AREA).max(LEAST_ENERGY);
+            let energy = energy(sum, square).max(LEAST_ENERGY);
             let correlation = (product - sum * block.mean) / energy.sqrt() * block.per_root;
             if correlation > best.correlation {
                 best = Place { first, correlation };
@@ -211,6 +211,12 @@ fn best_within_narrow(
         }
     }
     best
+}
+
+/// The sum of a block's squared deviations from the sums of its pixels and of their squares.
+#[inline(always)]
+fn energy(sum: f32, square: f32) -> f32 {
+    square - sum * sum / AREA
 }
 
 /// Sums over the pixels of the block from `first` on, each times some factors, which depend on the one of `others` in

@@ -108,6 +108,12 @@ impl Default for Settings {
 }
 
 impl Settings {
+    /// How far a right feature's rectified row may lie from that of a feature with σ `sigma_px`, px.
+    fn row_band_px(&self, sigma_px: f32) -> f64 {
+        self.row_band_px
+            .max(self.row_band_sigmas * f64::from(sigma_px))
+    }
+
     /// Refuses values out of range, and FLANN where it was not built in.
     ///
     /// # Errors

@@ -110,9 +110,7 @@ impl EpipolarBand {
         self.left.clear();
         self.left.extend(left.keypoints.iter().map(|k| {
             let at = rectification.left(&raw_px(k))?;
-            let half_px = settings
-                .row_band_px
-                .max(settings.row_band_sigmas * f64::from(k.sigma_px));
+            let half_px = settings.row_band_px(k.sigma_px);
             Some(LeftSight {
                 x_px: at.x,
                 top_px: at.y - half_px,
@@ -167,6 +165,6 @@ impl Window for EpipolarBand {
     }
 }
 
-fn raw_px(keypoint: &Keypoint) -> Vector2<f64> {
+pub(super) fn raw_px(keypoint: &Keypoint) -> Vector2<f64> {
     Vector2::new(f64::from(keypoint.x_px), f64::from(keypoint.y_px))
 }

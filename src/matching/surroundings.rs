@@ -6,6 +6,7 @@
 //! in finer ones. That takes a fraction of the time that finding and describing features does.
 
 use super::blocks::{self, Block, Place, Sums, first_pixel};
+use super::stereo::raw_px;
 use super::{Settings, StereoMatch};
 use crate::features::{Features, Keypoint};
 use crate::geometry::Rectification;
@@ -97,7 +98,7 @@ impl SurroundingsMatcher {
         keypoint: &Keypoint,
         images: &PyramidPair<'_>,
     ) -> Option<(Vector2<f64>, f32)> {
-        let px = Vector2::new(f64::from(keypoint.x_px), f64::from(keypoint.y_px));
+        let px = raw_px(keypoint);
         let at = self.rectification.left(&px)?;
         let mut level = COARSEST;
         let coarse = Surroundings::of(images.left.level(level), &px, level)?;
@@ -108,11 +109,8 @@ impl SurroundingsMatcher {
             found = finer.refine(images.right.level(level), &found, level)?;
         }
         let sigma_px = keypoint.sigma_px.max(SIGMA_PX * (1_u32 << level) as f32);
-        let half_px = self
-            .settings
-            .row_band_px
-            .max(self.settings.row_band_sigmas * f64::from(sigma_px));
-        let is_in_band = (at.y - self.rectification.right(&found)?.y).abs() <= half_px;
+        let off_px = (at.y - self.rectification.right(&found)?.y).abs();
+        let is_in_band = off_px <= self.settings.row_band_px(sigma_px);
         is_in_band.then_some((found, sigma_px))
     }
 
@@ -282,7 +280,7 @@ mod tests {
                 right.descriptor(m.right as usize),
                 pair.left.descriptor(m.left as usize)
             );
-            let px = Vector2::new(f64::from(keypoint.x_px), f64::from(keypoint.y_px));
+            let px = raw_px(keypoint);
             let (Some(depth_m), Some(ray)) = (looker.depth_m(&px), rig.left.unproject(&px)) else {
                 continue;
             };
@@ -291,8 +289,8 @@ mod tests {
                 continue;
             };
             all += 1;
-            let found = Vector2::new(f64::from(partner.x_px), f64::from(partner.y_px));
-            near += usize::from((found - truth).norm() < 3.0 * f64::from(partner.sigma_px));
+            near +=
+                usize::from((raw_px(partner) - truth).norm() < 3.0 * f64::from(partner.sigma_px));
         }
         // Most have one; not those that a body hides on the right or at whose edge two depths meet.
         assert!(2 * matches.len() > pair.left.len(), "{}", matches.len());

@@ -147,9 +147,7 @@ pub fn run<S: PairSource, E>(
 ) -> Result<(), PipelineError<E>> {
     prepare_thread();
     let under_way = pairs_under_way(source.is_live(), extractors.len());
-    let sides = Sides {
-        right: method.wants_right_features(),
-    };
+    let wants_right = method.wants_right_features();
     source.make_room(under_way);
     let (jobs_in, jobs) = bounded::<Job>(2 * under_way);
     let (done_in, done) = bounded::<Done>(2 * under_way + extractors.len() + 1);
@@ -163,7 +161,7 @@ pub fn run<S: PairSource, E>(
             let (jobs, done) = (jobs.clone(), done_in.clone());
             std::thread::Builder::new()
                 .name(format!("features-{n}"))
-                .spawn_scoped(scope, move || work(extractor, sides, &jobs, &done))
+                .spawn_scoped(scope, move || work(extractor, wants_right, &jobs, &done))
                 .map_err(PipelineError::Thread)?;
         }
         std::thread::Builder::new()
@@ -302,16 +300,10 @@ fn feed<S: PairSource>(
     }
 }
 
-/// The sides that features are wanted of, beside the left one.
-#[derive(Clone, Copy)]
-struct Sides {
-    right: bool,
-}
-
-/// Finds features until there are no more images.
+/// Finds features until there are no more images; in right ones only where they are wanted.
 fn work(
     mut extractor: Box<dyn Extractor>,
-    sides: Sides,
+    wants_right: bool,
     jobs: &Receiver<Job>,
     done: &Sender<Done>,
 ) {
@@ -328,7 +320,7 @@ fn work(
     prepare_thread();
     while let Ok(mut job) = jobs.recv() {
         let started = Instant::now();
-        let result = if job.side == Side::Left || sides.right {
+        let result = if job.side == Side::Left || wants_right {
             extractor.extract(&job.image, &mut job.described.features)
         } else {
             Ok(())

@@ -100,8 +100,7 @@ pub(super) struct Workbench {
     pub(super) rig: StereoRig,
     pub(super) matching: matching::Settings,
     pub(super) estimation: estimation::Settings,
-    stereo_matcher: StereoMatcher,
-    surroundings: SurroundingsMatcher,
+    left_right: LeftRight,
     pub(super) temporal_matcher: TemporalMatcher,
     pub(super) now: Seen,
     pub(super) predicted: Vec<Option<Vector4<f64>>>,
@@ -116,6 +115,24 @@ pub(super) struct Workbench {
     pub(super) watch: Option<RigWatch>,
     /// The epoch that the first pair begins, and where, if not at the origin.
     beginning: (u32, Option<Start>),
+}
+
+/// Finds the stereo matches.
+enum LeftRight {
+    Features(StereoMatcher),
+    Surroundings(SurroundingsMatcher),
+}
+
+impl LeftRight {
+    fn new(settings: &matching::Settings, rectification: Rectification) -> Self {
+        let settings = settings.clone();
+        match settings.partners {
+            Partners::Features => Self::Features(StereoMatcher::new(settings, rectification)),
+            Partners::Surroundings => {
+                Self::Surroundings(SurroundingsMatcher::new(settings, rectification))
+            }
+        }
+    }
 }
 
 enum Estimator {
@@ -163,8 +180,7 @@ impl Method {
             errors: RigErrors::of(&rig, &estimation),
             exposure: Exposure::default(),
             rig,
-            surroundings: SurroundingsMatcher::new(matching.clone(), rectification.clone()),
-            stereo_matcher: StereoMatcher::new(matching.clone(), rectification),
+            left_right: LeftRight::new(&matching, rectification),
             temporal_matcher: TemporalMatcher::new(matching.clone()),
             matching,
             estimation,
@@ -202,7 +218,7 @@ impl Method {
     /// Whether features of the right image are wanted.
     #[must_use]
     pub fn wants_right_features(&self) -> bool {
-        self.bench.matching.partners == Partners::Features
+        matches!(self.bench.left_right, LeftRight::Features(_))
     }
 
     /// How the rig is, where it is watched.
@@ -274,25 +290,19 @@ impl Method {
 
 impl Workbench {
     fn match_left_and_right(&mut self) -> Result<(), MatchError> {
-        let seen = &mut self.now;
-        if self.matching.partners == Partners::Surroundings {
-            let images = PyramidPair {
-                left: &seen.pair.left.pyramid,
-                right: &seen.pair.right.pyramid,
-            };
-            self.surroundings.find(
-                &seen.pair.left.features,
-                &images,
-                &mut seen.pair.right.features,
-                &mut seen.matches,
-            );
-            return Ok(());
+        let Seen { pair, matches, .. } = &mut self.now;
+        let (left, right) = (&pair.left, &mut pair.right);
+        match &mut self.left_right {
+            LeftRight::Features(matcher) => matcher.find(&left.features, &right.features, matches),
+            LeftRight::Surroundings(matcher) => {
+                let images = PyramidPair {
+                    left: &left.pyramid,
+                    right: &right.pyramid,
+                };
+                matcher.find(&left.features, &images, &mut right.features, matches);
+                Ok(())
+            }
         }
-        self.stereo_matcher.find(
-            &seen.pair.left.features,
-            &seen.pair.right.features,
-            &mut seen.matches,
-        )
     }
 
     fn triangulate(&mut self) {

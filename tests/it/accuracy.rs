@@ -53,9 +53,10 @@ fn assert_tracked(rows: &[visod::output::row::OdometryRow], pairs: usize) {
 }
 
 /// A configuration under which the right image is searched for the surroundings of left features.
-fn surroundings(folder: &Path) -> PathBuf {
+fn surroundings(folder: &Path, more: &str) -> PathBuf {
     let config = folder.join("surroundings.toml");
-    std::fs::write(&config, "[matching]\npartners = \"surroundings\"\n").unwrap();
+    let text = format!("[matching]\npartners = \"surroundings\"\n{more}");
+    std::fs::write(&config, text).unwrap();
     config
 }
 
@@ -67,7 +68,7 @@ fn a_drive_of_kitti_drifts_by_less_than_a_hundredth() {
 #[test]
 fn a_drive_of_kitti_drifts_no_more_without_features_on_the_right() {
     let folder = tempfile::tempdir().unwrap();
-    let config = surroundings(folder.path());
+    let config = surroundings(folder.path(), "");
     drive_of_kitti(&["--config", config.to_str().unwrap()]);
 }
 
@@ -77,22 +78,20 @@ fn without_features_on_the_right_any_number_of_workers_gives_the_same_bits() {
         return;
     };
     let folder = tempfile::tempdir().unwrap();
-    let csv = |workers: u32| {
-        let config = surroundings(folder.path());
-        let mut text = std::fs::read_to_string(&config).unwrap();
-        text += &format!("[pipeline]\nworkers = {workers}\n");
-        std::fs::write(&config, text).unwrap();
+    let estimates = |workers: u32| {
+        let more = format!("[pipeline]\nworkers = {workers}\n");
+        let config = surroundings(folder.path(), &more);
         let run = replay_quietly(&recording, &["--config", config.to_str().unwrap()]);
-        let estimates = |row: &visod::output::row::OdometryRow| {
+        let estimate = |row: &visod::output::row::OdometryRow| {
             (
                 row.odom_from_camera,
                 row.cov_pose,
                 row.counts.keypoints_right,
             )
         };
-        run.rows.iter().map(estimates).collect::<Vec<_>>()
+        run.rows.iter().map(estimate).collect::<Vec<_>>()
     };
-    assert_eq!(csv(1), csv(2));
+    assert_eq!(estimates(1), estimates(2));
 }
 
 fn drive_of_kitti(more: &[&str]) {
@@ -148,7 +147,7 @@ fn a_rendered_drive_in_full_size_ends_near_the_truth() {
     let simulated: Value = serde_json::from_slice(&output.stdout).unwrap();
     let path_m = simulated["length_m"].as_f64().unwrap();
     assert_eq!(simulated["width_px"].as_u64(), Some(1280));
-    let config = surroundings(folder.path());
+    let config = surroundings(folder.path(), "");
     for more in [&[][..], &["--config", config.to_str().unwrap()]] {
         let run = replay_quietly(&recording, more);
         assert_tracked(&run.rows, 20);
