@@ -96,7 +96,10 @@ mod tests {
     #[test]
     fn no_stage_allocates_after_warm_up() {
         let recording = Recording::simulated(small_rig(), FRAMES);
-        let described = features_do_not_allocate(&recording);
+        let mut lean = features::Settings::default();
+        (lean.surf.sampling_px, lean.surf.upright) = (2, true);
+        features_do_not_allocate(&recording, &lean);
+        let described = features_do_not_allocate(&recording, &features::Settings::default());
         matching_does_not_allocate(&recording, &described);
         for partners in [Partners::Features, Partners::Surroundings] {
             the_method_does_not_allocate(&recording, &described, partners);
@@ -109,8 +112,11 @@ mod tests {
         features::extractor(&features::Settings::default()).expect("the defaults are in range")
     }
 
-    fn features_do_not_allocate(recording: &Recording) -> Vec<[Features; 2]> {
-        let mut extractor = extractor();
+    fn features_do_not_allocate(
+        recording: &Recording,
+        settings: &features::Settings,
+    ) -> Vec<[Features; 2]> {
+        let mut extractor = features::extractor(settings).expect("in range");
         let mut described = vec![<[Features; 2]>::default(); recording.pairs.len()];
         let mut features = Features::default();
         for place in 0..WARM_UP + COUNTED {

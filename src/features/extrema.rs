@@ -1,10 +1,10 @@
 //! Extrema of the fast Hessian: an integral image in, keypoints with place, size and strength out.
 //!
-//! An octave samples every 2ⁿ-th pixel with `layers + 2` filters. A sample is a keypoint if its
-//! determinant is above the threshold and above all 26 neighbours in row, column and layer; a
-//! quadratic through these 27 then gives place and size between the samples (Brown and Lowe,
-//! *Invariant Features from Interest Point Groups*, 2002), and a candidate whose top lies more than
-//! one sample away is none.
+//! An octave samples every 2ⁿ-th pixel, or every second of these, with `layers + 2` filters. A sample
+//! is a keypoint if its determinant is above the threshold and above all 26 neighbours in row, column
+//! and layer; a quadratic through these 27 then gives place and size between the samples (Brown and
+//! Lowe, *Invariant Features from Interest Point Groups*, 2002), and a candidate whose top lies more
+//! than one sample away is none.
 //!
 //! The lowest and the highest layer of an octave hold no keypoints. They are not searched, so what is
 //! found is candidates: samples that exceed their neighbours in the layers between. Only those that
@@ -32,14 +32,21 @@ pub(super) struct Search {
     pub octaves: u32,
     /// Layers of an octave in which keypoints may lie.
     pub layers: usize,
+    /// Distance of the samples in the first octave, px, a power of two.
+    pub sampling_px: usize,
     /// The determinant that a keypoint exceeds.
     pub threshold: f32,
 }
 
 impl Search {
+    /// The filter of a layer, both it and the octave counted from 0.
+    fn filter(&self, octave: u32, layer: usize) -> Filter {
+        Filter::new(octave, layer, self.sampling_px)
+    }
+
     /// Size of the largest keypoint that may be found, px.
     pub(super) fn largest_px(&self) -> f32 {
-        Filter::new(self.octaves - 1, self.layers + 1).size_px as f32
+        self.filter(self.octaves - 1, self.layers + 1).size_px as f32
     }
 }
 
@@ -56,6 +63,8 @@ pub(super) struct Detector {
     samples: usize,
     /// Row by row of each layer but the lowest and the highest.
     determinants: Vec<f32>,
+    /// Around each candidate, the samples in its own layer and those beside it, as far as these are searched.
+    around: Vec<[Layer; 3]>,
 }
 
 /// A sample that may be a keypoint.
@@ -65,37 +74,40 @@ pub(super) struct Candidate {
     layer: u8,
     row: u32,
     column: u32,
-    /// The samples around it in its own layer and those beside it, as far as these are searched.
-    near: [Layer; 3],
+    /// Where the sample lies, and how far from its neighbours.
+    middle_px: [f32; 2],
+    step_px: f32,
+    response: f32,
+    /// Which of those of its image it is.
+    number: u32,
 }
 
 impl Candidate {
     /// One without neighbours.
     #[cfg(test)]
     pub(super) fn lone(octave: u8, (row, column): (u32, u32), response: f32) -> Self {
-        let mut near = [[[0.0; 3]; 3]; 3];
-        near[1][1][1] = response;
+        let filter = Filter::new(octave.into(), 1, 1);
         Self {
             octave,
             layer: 1,
             row,
             column,
-            near,
+            middle_px: [column, row].map(|sample| filter.middle_px(sample as usize)),
+            step_px: filter.step_px as f32,
+            response,
+            number: 0,
         }
     }
 
     /// Its determinant.
     pub(super) fn response(&self) -> f32 {
-        self.near[1][1][1]
+        self.response
     }
 
     /// Where the keypoint lies: from the first to the second value of each coordinate, px.
     pub(super) fn reach_px(&self) -> [[f32; 2]; 2] {
-        let step_px = (1 << self.octave) as f32;
-        [self.column, self.row].map(|sample| {
-            let middle_px = middle_px(sample as usize, step_px);
-            [middle_px - step_px, middle_px + step_px]
-        })
+        self.middle_px
+            .map(|middle_px| [middle_px - self.step_px, middle_px + self.step_px])
     }
 }
 
@@ -103,17 +115,25 @@ impl Candidate {
 type Layer = [[f32; 3]; 3];
 
 impl Detector {
-    /// Appends the candidates to `found`, octave by octave, row by row.
+    /// Makes room for that many candidates.
+    pub(super) fn make_room(&mut self, candidates: usize) {
+        make_room(&mut self.around, candidates);
+    }
+
+    /// Replaces `found` by an image's candidates, octave by octave, row by row.
     pub(super) fn detect(
         &mut self,
         integral: &IntegralImage,
         search: Search,
         found: &mut Vec<Candidate>,
     ) {
-        self.columns.begin(integral, search.octaves - 1);
+        found.clear();
+        self.around.clear();
+        let widest = search.sampling_px << (search.octaves - 1);
+        self.columns.begin(integral, widest);
         self.filters.resize(search.octaves as usize, Vec::new());
         for octave in 0..search.octaves {
-            let filters = (0..search.layers + 2).map(|layer| Filter::new(octave, layer));
+            let filters = (0..search.layers + 2).map(|layer| search.filter(octave, layer));
             let fitting = &mut self.filters[octave as usize];
             fitting.clear();
             make_room(fitting, search.layers + 2);
@@ -121,9 +141,7 @@ impl Detector {
             if fitting.len() < 3 {
                 break;
             }
-            if octave > 0 {
-                self.columns.double_step(integral);
-            }
+            self.columns.widen(integral, fitting[0].step_px);
             self.detect_in_octave(integral, search.threshold, octave, found);
         }
     }
@@ -135,8 +153,8 @@ impl Detector {
         octave: u32,
         found: &mut Vec<Candidate>,
     ) {
-        self.samples = integral.width() >> octave;
         let filters = &self.filters[octave as usize];
+        self.samples = integral.width() / filters[0].step_px;
         let values = (filters.len() - 2) * 3 * self.samples;
         let strip = if octave == 0 { STRIP } else { self.samples };
         // The first sample with complete neighbours in the second layer.
@@ -160,7 +178,7 @@ impl Detector {
         found: &mut Vec<Candidate>,
     ) {
         let around = strip.start - 1..strip.end + 1;
-        for row in 0..integral.height() >> octave {
+        for row in 0..integral.height() / self.filters[octave as usize][0].step_px {
             let layers = 1..self.filters[octave as usize].len() - 1;
             for layer in layers.clone() {
                 let filter = &self.filters[octave as usize][layer];
@@ -194,41 +212,45 @@ impl Detector {
         found: &mut Vec<Candidate>,
     ) {
         // All neighbours must be complete, which the layer above decides.
-        let margin = self.filters[octave as usize][layer + 1].margin() + 1;
-        let rows = integral.height() >> octave;
+        let filter = &self.filters[octave as usize][layer + 1];
+        let margin = filter.margin() + 1;
+        let rows = integral.height() / filter.step_px;
         if centre < margin || centre + margin >= rows || 2 * margin >= self.samples {
             return;
         }
         let columns = strip.start.max(margin)..strip.end.min(self.samples - margin);
         let mut highest = std::mem::take(&mut self.highest);
         let mut marks = std::mem::take(&mut self.marks);
+        let mut around = std::mem::take(&mut self.around);
         highest.clear();
-        let near = [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
-        let beside = [layer - 1, layer + 1].map(|beside| {
-            if self.is_held(octave, beside) {
-                self.row(beside, centre)
-            } else {
-                near[0]
-            }
-        });
-        let rows = [near[0], near[1], near[2], beside[0], beside[1]];
+        let rows_of =
+            |layer: usize| [centre - 1, centre, centre + 1].map(|row| self.row(layer, row));
+        let here = rows_of(layer);
+        let beside =
+            [layer - 1, layer + 1].map(|layer| self.is_held(octave, layer).then(|| rows_of(layer)));
+        let [finer, coarser] = beside.map(|rows| rows.map_or(here[0], |rows| rows[1]));
+        let rows = [here[0], here[1], here[2], finer, coarser];
         find_highest(&rows, threshold, columns, &mut marks, &mut highest);
         for &column in &highest {
-            let mut near = [[[0.0; 3]; 3]; 3];
-            self.copy_held((octave, layer, centre, column), &mut near);
-            let value = near[1][1][1];
+            let response = here[1][column];
+            let [finer, coarser] =
+                beside.map(|rows| rows.map_or(Layer::default(), |rows| near(rows, column)));
             // A layer that is not held is zero here, and the value above a threshold that is not below.
-            if exceeds(value, &near[0]) && exceeds(value, &near[2]) {
+            if exceeds(response, &finer) && exceeds(response, &coarser) {
                 found.push(Candidate {
                     octave: octave as u8,
                     layer: layer as u8,
                     row: centre as u32,
                     column: column as u32,
-                    near,
+                    middle_px: [column, centre].map(|sample| filter.middle_px(sample)),
+                    step_px: filter.step_px as f32,
+                    response,
+                    number: around.len() as u32,
                 });
+                around.push([finer, near(here, column), coarser]);
             }
         }
-        (self.highest, self.marks) = (highest, marks);
+        (self.highest, self.marks, self.around) = (highest, marks, around);
     }
 
     /// Whether a layer is an inner one.
@@ -246,23 +268,6 @@ impl Detector {
         &self.determinants[self.start(layer, row)..][..self.samples]
     }
 
-    /// Copies the samples around one in its layer and those beside it that are held.
-    fn copy_held(
-        &self,
-        (octave, layer, row, column): (u32, usize, usize, usize),
-        near: &mut [Layer; 3],
-    ) {
-        for (n, values) in near.iter_mut().enumerate() {
-            let layer = layer + n - 1;
-            if self.is_held(octave, layer) {
-                for (y, values) in values.iter_mut().enumerate() {
-                    let held = self.row(layer, row + y - 1);
-                    values.copy_from_slice(&held[column - 1..=column + 1]);
-                }
-            }
-        }
-    }
-
     /// The keypoint at a candidate of the last image, without direction and σ; `None` unless it
     /// exceeds its neighbours in the layers that were not searched, too, and has a top.
     pub(super) fn confirm(
@@ -273,7 +278,7 @@ impl Detector {
         let (octave, layer) = (candidate.octave, candidate.layer as usize);
         let filters = &self.filters[octave as usize];
         let at = (candidate.row as usize, candidate.column as usize);
-        let mut layers = candidate.near;
+        let mut layers = self.around[candidate.number as usize];
         for n in [0, 2] {
             if !self.is_held(u32::from(octave), layer + n - 1) {
                 let filter = &filters[layer + n - 1];
@@ -299,6 +304,7 @@ impl Detector {
             + self.highest.capacity()
             + self.filters.iter().map(Vec::capacity).sum::<usize>()
             + self.determinants.capacity()
+            + self.around.capacity()
     }
 }
 
@@ -334,17 +340,11 @@ fn place(
 ) -> Keypoint {
     let step_px = filter.step_px as f32;
     Keypoint {
-        x_px: middle_px(column, step_px) + offset[0] * step_px,
-        y_px: middle_px(row, step_px) + offset[1] * step_px,
+        x_px: filter.middle_px(column) + offset[0] * step_px,
+        y_px: filter.middle_px(row) + offset[1] * step_px,
         size_px: (filter.size_px as f32 + offset[2] * layer_step_px).round_ties_even(),
         ..Keypoint::default()
     }
-}
-
-/// The middle of the filter at a sample, which has an even number of pixels from the second octave
-/// on.
-fn middle_px(sample: usize, step_px: f32) -> f32 {
-    (sample as f32 + 0.5) * step_px - 0.5
 }
 
 /// Appends every column of the middle of three rows that exceeds the threshold, its eight
@@ -397,6 +397,15 @@ fn mark_highest_narrow(rows: [&[f32]; 5], threshold: f32, marks: &mut [u8]) {
         let bar = higher(higher(layers, sides), higher(upper, lower));
         marks[x] = u8::from(value[x] > bar);
     }
+}
+
+/// The samples around a column of three rows.
+#[inline(always)]
+fn near(rows: [&[f32]; 3], column: usize) -> Layer {
+    rows.map(|row| {
+        let samples = &row[column - 1..column + 2];
+        [samples[0], samples[1], samples[2]]
+    })
 }
 
 /// Whether `value` exceeds all samples of a layer.

@@ -29,12 +29,13 @@ const MIXED_WEIGHT: f32 = 0.81;
 /// The three box filters of one size.
 #[derive(Clone, Debug)]
 pub(super) struct Filter {
-    /// Side of the filter, px: `taps * step_px`.
+    /// Side of the filter, px.
     pub size_px: usize,
-    /// Side of the filter in sampling steps, an odd number.
-    pub taps: usize,
     /// Distance of neighbouring samples, px.
     pub step_px: usize,
+    /// How many pixels of the filter come before the one that a sample is named after: sample `n` is of pixel
+    /// `n * step_px`.
+    before_px: usize,
     /// Where the `n`-th ninth of the side ends, px.
     ninth_px: [usize; 10],
     /// One over the area of a box of D_xx and D_yy.
@@ -75,18 +76,18 @@ impl Combined {
 }
 
 impl Filter {
-    /// The filter of layer `layer` in octave `octave`, both counted from 0.
-    pub(super) fn new(octave: u32, layer: usize) -> Self {
-        let step_px = 1_usize << octave;
+    /// The filter of layer `layer` in octave `octave`, both counted from 0; in the first octave samples are
+    /// `sampling_px` apart, a power of two.
+    pub(super) fn new(octave: u32, layer: usize, sampling_px: usize) -> Self {
         let taps = 9 + 6 * layer;
-        let size_px = taps * step_px;
+        let size_px = taps << octave;
         // The side is a multiple of three, so a multiple of a ninth of it is never half a pixel.
         let ninth_px = std::array::from_fn(|n| (2 * n * size_px + 9) / 18);
         let third = ninth_px[3];
         Self {
             size_px,
-            taps,
-            step_px,
+            step_px: sampling_px << octave,
+            before_px: (taps / 2) << octave,
             ninth_px,
             per_area: 1.0 / (third * (ninth_px[7] - ninth_px[2])) as f32,
             per_mixed_area: 1.0 / (third * third) as f32,
@@ -96,7 +97,21 @@ impl Filter {
     /// How many samples from the border the first complete one lies.
     #[inline]
     pub(super) fn margin(&self) -> usize {
-        self.taps / 2
+        self.before_px.div_ceil(self.step_px)
+    }
+
+    /// The pixel row or column that the filter begins at, of a sample that is complete.
+    #[inline(always)]
+    fn begin_px(&self, sample: usize) -> usize {
+        sample * self.step_px - self.before_px
+    }
+
+    /// The middle of the filter at a sample, px; it has an even number of pixels from the second octave on.
+    #[inline]
+    pub(super) fn middle_px(&self, sample: usize) -> f32 {
+        let after_px = self.size_px - 1 - self.before_px;
+        let beyond_px = (after_px - self.before_px) as f32;
+        (sample * self.step_px) as f32 + 0.5 * beyond_px
     }
 
     /// Whether the filter fits into the image at all.
@@ -111,9 +126,9 @@ impl Filter {
     pub(super) fn samples(&self, integral: &IntegralImage, row: usize) -> usize {
         let complete = self.fits(integral)
             && row >= self.margin()
-            && (row - self.margin()) * self.step_px + self.size_px <= integral.height();
+            && self.begin_px(row) + self.size_px <= integral.height();
         if complete {
-            1 + (integral.width() - self.size_px) / self.step_px
+            (integral.width() + self.before_px - self.size_px) / self.step_px + 1 - self.margin()
         } else {
             0
         }
@@ -130,8 +145,7 @@ impl Filter {
         out: &mut [f32],
     ) {
         debug_assert_eq!(columns.step(), self.step_px);
-        let top = (row - self.margin()) * self.step_px;
-        let left = (column - self.margin()) * self.step_px;
+        let (top, left) = (self.begin_px(row), self.begin_px(column));
         let rows = self
             .ninth_px
             .map(|ninth_px| columns.row(integral, top + ninth_px));
@@ -139,7 +153,7 @@ impl Filter {
         let starts = self
             .ninth_px
             .map(|ninth_px| columns.place(left + ninth_px % self.step_px));
-        let len = out.len() + self.taps;
+        let len = out.len() + self.size_px / self.step_px;
         respond(self, &rows, &starts, combined.stretches(len), out);
     }
 
@@ -163,9 +177,8 @@ impl Filter {
     /// The rows and the columns at the filter's ninths around a sample.
     #[inline(always)]
     fn corners(&self, row: usize, column: usize) -> [[usize; 10]; 2] {
-        let top = (row - self.margin()) * self.step_px;
-        let left = (column - self.margin()) * self.step_px;
-        [top, left].map(|from| self.ninth_px.map(|ninth_px| from + ninth_px))
+        [self.begin_px(row), self.begin_px(column)]
+            .map(|from| self.ninth_px.map(|ninth_px| from + ninth_px))
     }
 
     /// The determinant from the sums over the boxes.
@@ -198,7 +211,7 @@ fn respond_narrow(
     stretches: &mut [i32],
     out: &mut [f32],
 ) {
-    let len = out.len() + filter.taps;
+    let len = out.len() + filter.size_px / filter.step_px;
     let mut room = Room {
         filter,
         starts,
@@ -349,10 +362,13 @@ mod tests {
         let mut integral = IntegralImage::default();
         integral.compute(&image);
         let mut combined = Combined::default();
-        for (octave, layer) in (0..4).flat_map(|o| (0..5).map(move |l| (o, l))) {
-            let filter = Filter::new(octave, layer);
-            let columns = sorted(&integral, octave);
-            for row in 0..97 >> octave {
+        let octaves = [1, 2].into_iter().flat_map(|s| (0..4).map(move |o| (s, o)));
+        for (sampling_px, octave, layer) in
+            octaves.flat_map(|(s, o)| (0..5).map(move |l| (s, o, l)))
+        {
+            let filter = Filter::new(octave, layer, sampling_px);
+            let columns = sorted(&integral, filter.step_px);
+            for row in 0..97 / filter.step_px {
                 let samples = filter.samples(&integral, row);
                 let mut out = vec![f32::NAN; 131];
                 if samples > 0 {
@@ -366,8 +382,8 @@ mod tests {
                     );
                 }
                 for j in (0..samples).step_by(3) {
-                    let top = (row - filter.margin()) * filter.step_px;
-                    let b = |n| mean(&image, &filter, (j * filter.step_px, top), n);
+                    let corner = [filter.margin() + j, row].map(|n| filter.begin_px(n));
+                    let b = |n| mean(&image, &filter, corner.into(), n);
                     let xx = b([0, 2, 3, 7]) - 2.0 * b([3, 2, 6, 7]) + b([6, 2, 9, 7]);
                     let yy = b([2, 0, 7, 3]) - 2.0 * b([2, 3, 7, 6]) + b([2, 6, 7, 9]);
                     let xy = b([1, 1, 4, 4]) - b([5, 1, 8, 4]) - b([1, 5, 4, 8]) + b([5, 5, 8, 8]);
@@ -387,10 +403,10 @@ mod tests {
         }
     }
 
-    fn sorted(integral: &IntegralImage, octave: u32) -> SortedColumns {
+    fn sorted(integral: &IntegralImage, step_px: usize) -> SortedColumns {
         let mut columns = SortedColumns::default();
-        columns.begin(integral, octave);
-        (0..octave).for_each(|_| columns.double_step(integral));
+        columns.begin(integral, step_px);
+        columns.widen(integral, step_px);
         columns
     }
 
@@ -400,7 +416,7 @@ mod tests {
         let mut integral = IntegralImage::default();
         integral.compute(&image);
         for layer in 0..5 {
-            let filter = Filter::new(0, layer);
+            let filter = Filter::new(0, layer, 1);
             let rows = filter.ninth_px.map(|y| integral.row(y));
             let samples = filter.samples(&integral, filter.margin());
             let (mut wide, mut narrow) = (vec![0.0; samples], vec![1.0; samples]);
@@ -424,9 +440,9 @@ mod tests {
         let image = GrayImage::from_vec(5000, 4000, pixels).unwrap_or_default();
         let mut integral = IntegralImage::default();
         integral.compute(&image);
-        let filter = Filter::new(0, 2);
+        let filter = Filter::new(0, 2, 1);
         let mut out = vec![0.0; 5000];
-        let columns = sorted(&integral, 0);
+        let columns = sorted(&integral, 1);
         filter.respond(
             &integral,
             &columns,

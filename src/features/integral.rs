@@ -82,15 +82,24 @@ pub(super) struct SortedColumns {
 
 impl SortedColumns {
     /// Takes the columns of `integral` as they are: a step of 1. They are copied at the first
-    /// [`Self::double_step`] only; `steps` is how many of these there will be at most.
-    pub(super) fn begin(&mut self, integral: &IntegralImage, steps: u32) {
+    /// [`Self::widen`] only; `widest` is the step that this will come to at most, a power of two.
+    ///
+    /// A row is longer than the image's by a step at least, which lets a stretch of columns begin anywhere and end
+    /// one step beyond the last.
+    pub(super) fn begin(&mut self, integral: &IntegralImage, widest: usize) {
         self.step = 1;
-        self.row_len = integral.stride.next_multiple_of(1 << steps);
+        self.row_len = (integral.stride + widest).next_multiple_of(widest);
         self.row.resize(self.row_len, 0);
     }
 
-    /// Doubles the step.
-    pub(super) fn double_step(&mut self, integral: &IntegralImage) {
+    /// Doubles the step until it is `step`.
+    pub(super) fn widen(&mut self, integral: &IntegralImage, step: usize) {
+        while self.step < step {
+            self.double_step(integral);
+        }
+    }
+
+    fn double_step(&mut self, integral: &IntegralImage) {
         let half = self.row_len / 2;
         self.sums.resize(self.row_len * (integral.height() + 1), 0);
         for (y, sums) in self.sums.chunks_exact_mut(self.row_len).enumerate() {
@@ -201,17 +210,15 @@ mod tests {
         integral.compute(&image);
         let mut sorted = SortedColumns::default();
         for _ in 0..2 {
-            sorted.begin(&integral, 3);
+            sorted.begin(&integral, 8);
             for octave in 0..4 {
+                sorted.widen(&integral, 1 << octave);
                 assert_eq!(sorted.step(), 1 << octave);
                 for (x, y) in (0..=37).flat_map(|x| (0..=5).map(move |y| (x, y))) {
                     let found = sorted.row(&integral, y)[sorted.place(x)];
                     assert_eq!(found, integral.row(y)[x], "{octave} {x} {y}");
                     let next = x + sorted.step();
                     assert!(next > 37 || sorted.place(next) == sorted.place(x) + 1);
-                }
-                if octave < 3 {
-                    sorted.double_step(&integral);
                 }
             }
         }

@@ -15,6 +15,7 @@ mod patch;
 mod pyramid;
 mod spread;
 pub mod surf;
+mod upright;
 
 pub use choice::{DetectorName, Settings, extractor};
 

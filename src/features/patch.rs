@@ -11,27 +11,39 @@
 use super::Keypoint;
 use super::orientation::Direction;
 use super::pyramid::{Level, Pyramid};
+use super::upright::sample_upright;
 use crate::image::GrayImage;
 use crate::simd::{round_i32, widened};
 
 /// Cells across the patch.
 pub(super) const CELLS: usize = 21;
 /// Samples across a cell.
-const SAMPLES_PER_CELL: usize = 2;
+pub(super) const SAMPLES_PER_CELL: usize = 2;
 /// Samples across the patch.
-const SAMPLES: usize = CELLS * SAMPLES_PER_CELL;
+pub(super) const SAMPLES: usize = CELLS * SAMPLES_PER_CELL;
 /// [`SAMPLES`] rounded up to full vector registers.
 const SAMPLES_PADDED: usize = SAMPLES.next_multiple_of(8);
 /// Largest side of a cell in pixels of the level it is sampled from.
 const CELL_MAX_PX: f32 = 2.5;
 /// Bits of a sample's place behind the point.
 const FRACTION_BITS: i32 = 15;
+/// All of them.
+const FRACTION: i32 = (1 << FRACTION_BITS) - 1;
 
 /// A piece of a level: what lies to the right of and below one of its pixels.
 struct Window<'a> {
     level: &'a Level,
     left: i32,
     top: i32,
+}
+
+impl Window<'_> {
+    fn pixels(&self) -> Pixels<'_> {
+        Pixels {
+            pitch: self.level.pitch(),
+            pairs: self.level.from(self.left, self.top),
+        }
+    }
 }
 
 /// The means of the cells, times the samples in one.
@@ -88,7 +100,12 @@ impl Patch {
         };
         let centre_px = [x_px - left as f32, y_px - top as f32];
         let spacing_px = cell_px / SAMPLES_PER_CELL as f32;
-        sample(&window, centre_px, spacing_px, direction, &mut self.cells);
+        let pixels = window.pixels();
+        if direction == Direction::UP {
+            sample_upright(&pixels, centre_px, spacing_px, &mut self.cells);
+        } else {
+            sample(&pixels, centre_px, spacing_px, direction, &mut self.cells);
+        }
         &self.cells
     }
 
@@ -116,9 +133,9 @@ fn level_of(mut cell_px: f32) -> (usize, f32) {
 }
 
 widened! {
-    /// Samples the window at `spacing_px` around `centre_px` and sums up the samples of each cell.
+    /// Samples the pixels at `spacing_px` around `centre_px` and sums up the samples of each cell.
     fn sample = sample_narrow, (
-        window: &Window,
+        pixels: &Pixels,
         centre_px: [f32; 2],
         spacing_px: f32,
         direction: Direction,
@@ -128,7 +145,7 @@ widened! {
 
 #[inline(always)]
 fn sample_narrow(
-    window: &Window,
+    pixels: &Pixels,
     centre_px: [f32; 2],
     spacing_px: f32,
     direction: Direction,
@@ -139,14 +156,10 @@ fn sample_narrow(
     let across = [line(0.0, spacing_px * cos), line(0.0, spacing_px * sin)];
     let down_x = line(centre_px[0], -spacing_px * sin);
     let down_y = line(centre_px[1], spacing_px * cos);
-    let pixels = Pixels {
-        pitch: window.level.pitch(),
-        pairs: window.level.from(window.left, window.top),
-    };
     for row in 0..CELLS {
         let mut sums = [0.0; SAMPLES_PADDED];
         for a in row * SAMPLES_PER_CELL..(row + 1) * SAMPLES_PER_CELL {
-            add_row(&pixels, &across, [down_x[a], down_y[a]], &mut sums);
+            add_row(pixels, &across, [down_x[a], down_y[a]], &mut sums);
         }
         for column in 0..CELLS {
             cells[row][column] = sums[2 * column] + sums[2 * column + 1];
@@ -155,14 +168,22 @@ fn sample_narrow(
 }
 
 /// The pixels of a window, row by row, each with the one below it in its upper byte.
-struct Pixels<'a> {
-    pitch: usize,
-    pairs: &'a [u16],
+pub(super) struct Pixels<'a> {
+    pub(super) pitch: usize,
+    pub(super) pairs: &'a [u16],
+}
+
+/// The pixel before a place in 2⁻¹⁵ px, and how far beyond it the place lies, px.
+#[inline(always)]
+pub(super) fn split(place: i32) -> (usize, f32) {
+    let fraction = place & FRACTION;
+    let pixel = (place >> FRACTION_BITS) as usize;
+    (pixel, fraction as f32 * (1.0 / (FRACTION + 1) as f32))
 }
 
 /// One coordinate of the samples of a row or a column, in 2⁻¹⁵ px.
 #[inline(always)]
-fn line(middle_px: f32, step_px: f32) -> [i32; SAMPLES_PADDED] {
+pub(super) fn line(middle_px: f32, step_px: f32) -> [i32; SAMPLES_PADDED] {
     const UNIT: f32 = (1 << FRACTION_BITS) as f32;
     let mut line = [0; SAMPLES_PADDED];
     for n in 0..SAMPLES_PADDED {
@@ -181,7 +202,6 @@ fn add_row(
     [x0, y0]: [i32; 2],
     sums: &mut [f32; SAMPLES_PADDED],
 ) {
-    const FRACTION: i32 = (1 << FRACTION_BITS) - 1;
     let pitch = pixels.pitch as i32;
     let mut places = [0_u32; SAMPLES_PADDED];
     let (mut right, mut low) = ([0.0_f32; SAMPLES_PADDED], [0.0_f32; SAMPLES_PADDED]);
@@ -209,6 +229,7 @@ fn add_row(
 
 #[cfg(test)]
 mod tests {
+    use super::super::upright::sample_upright_narrow;
     use super::*;
 
     /// A plane of grey values, which interpolation reproduces.
@@ -258,6 +279,38 @@ mod tests {
         }
     }
 
+    /// Their places are rounded once instead of twice, by 2⁻¹⁵ px at most.
+    #[test]
+    fn upright_patches_are_those_of_samples_that_are_looked_up_one_by_one() {
+        let pixels = (0..150_u32 * 100).map(|n| (n * n * 31 % 251) as u8);
+        let image = GrayImage::from_vec(150, 100, pixels.collect()).unwrap_or_default();
+        let mut pyramid = Pyramid::default();
+        for (left, top, spacing_px) in [(-5, 30, 0.7), (100, -10, 1.0), (60, 40, 1.24999)] {
+            let level = pyramid.level(&image, 0);
+            let window = Window { level, left, top };
+            let pixels = window.pixels();
+            let (mut upright, mut narrow) = ([[0.0; CELLS]; CELLS], [[1.0; CELLS]; CELLS]);
+            let mut looked_up = [[2.0; CELLS]; CELLS];
+            let centre_px = [27.3, 27.999];
+            sample_upright(&pixels, centre_px, spacing_px, &mut upright);
+            sample_upright_narrow(&pixels, centre_px, spacing_px, &mut narrow);
+            sample(
+                &pixels,
+                centre_px,
+                spacing_px,
+                Direction::UP,
+                &mut looked_up,
+            );
+            assert_eq!(upright, narrow);
+            let differences = upright.as_flattened().iter().zip(looked_up.as_flattened());
+            assert!(
+                differences
+                    .map(|(a, b)| (a - b).abs())
+                    .all(|difference| difference < 0.1)
+            );
+        }
+    }
+
     #[test]
     fn wider_registers_give_the_same_bits() {
         let pixels = (0..150_u32 * 100).map(|n| (n * n * 31 % 251) as u8);
@@ -274,8 +327,9 @@ mod tests {
             sin: 0.841_471,
         };
         let (mut wide, mut narrow) = ([[0.0; CELLS]; CELLS], [[1.0; CELLS]; CELLS]);
-        sample(&window, [40.3, 39.6], 1.2, direction, &mut wide);
-        sample_narrow(&window, [40.3, 39.6], 1.2, direction, &mut narrow);
+        let pixels = window.pixels();
+        sample(&pixels, [40.3, 39.6], 1.2, direction, &mut wide);
+        sample_narrow(&pixels, [40.3, 39.6], 1.2, direction, &mut narrow);
         assert_eq!(wide, narrow);
     }
 }

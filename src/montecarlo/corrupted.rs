@@ -10,8 +10,9 @@ use super::images::{SEQUENCES, rendered};
 use super::world::RigDraw;
 use super::{MonteCarloError, RigError, Settings, for_each_run, rng_of_run};
 use crate::capture::StereoPair;
-use crate::estimation::{self, Odometry, PairStamp, Status};
-use crate::features::{self, Extractor};
+use crate::config::Config;
+use crate::estimation::{Odometry, PairStamp, Status};
+use crate::features;
 use crate::geometry::{StereoRig, se3};
 use crate::pipeline::{DescribedPair, Method};
 use crate::simulation::corruption::{Corruption, MAX_LAG, Material, Spoiler};
@@ -170,13 +171,14 @@ impl CorruptedOutcome {
     }
 }
 
-/// Follows `runs` sequences through each corruption of `kinds`. `rig` states its uncertainty, of which each sequence
-/// draws. `progress` hears of each sequence.
+/// Follows `runs` sequences through each corruption of `kinds`, as configured but for fewer features and landmarks.
+/// `rig` states its uncertainty, of which each sequence draws. `progress` hears of each sequence.
 ///
 /// # Errors
 /// The rig states no uncertainty.
 pub fn run_corrupted(
     rig: &StereoRig,
+    config: &Config,
     kinds: &[Corruption],
     runs: u64,
     seed: u64,
@@ -189,6 +191,13 @@ pub fn run_corrupted(
     let Some(rigs) = RigDraw::new(rig, &settings)? else {
         return Err(MonteCarloError::NoRigUncertainty);
     };
+    let mut config = config.clone();
+    let budgets = (
+        &mut config.features.surf.budget,
+        &mut config.estimation.max_landmarks,
+    );
+    *budgets.0 = FEATURES.min(*budgets.0);
+    *budgets.1 = LANDMARKS.min(*budgets.1);
     let mut outcome = CorruptedOutcome {
         kinds: kinds.iter().map(|kind| (*kind, Tally::default())).collect(),
         wrong: Vec::new(),
@@ -197,8 +206,9 @@ pub fn run_corrupted(
         runs,
         |run| {
             let seen = rigs.draw(rig, &mut rng_of_run(seed, STAGE, run));
-            let film = Film::new(&seen, run, seed)?;
-            let follow = |kind: &Corruption| film.follow(rig, *kind, [seed ^ *kind as u64, run]);
+            let film = Film::new(&seen, &config, run, seed)?;
+            let follow =
+                |kind: &Corruption| film.follow(rig, &config, *kind, [seed ^ *kind as u64, run]);
             kinds.iter().map(follow).collect::<Option<Vec<_>>>()
         },
         progress,
@@ -222,21 +232,15 @@ struct Film {
     other_place: StereoPair,
 }
 
-fn extractor() -> Option<Box<dyn Extractor>> {
-    let mut settings = features::Settings::default();
-    settings.surf.budget = FEATURES;
-    features::extractor(&settings).ok()
-}
-
 impl Film {
-    fn new(seen: &StereoRig, run: u64, seed: u64) -> Option<Self> {
+    fn new(seen: &StereoRig, config: &Config, run: u64, seed: u64) -> Option<Self> {
         let of = |run: u64| {
             let sequences = [&SEQUENCES[..], &MORE_SEQUENCES].concat();
             let sequence = sequences[(run % sequences.len() as u64) as usize];
             rendered(sequence, seen.clone(), PAIRS as u64, seed.wrapping_add(run))
         };
         let simulation = of(run)?;
-        let mut extractor = extractor()?;
+        let mut extractor = features::extractor(&config.features).ok()?;
         let mut film = Self {
             pairs: Vec::new(),
             described: Vec::new(),
@@ -258,17 +262,15 @@ impl Film {
     fn follow(
         &self,
         rig: &StereoRig,
+        config: &Config,
         kind: Corruption,
         [seed, run]: [u64; 2],
     ) -> Option<(Tally, Vec<Wrong>)> {
         let mut rng = rng_of_run(seed, STAGE, run);
-        let mut extractor = extractor()?;
-        let settings = estimation::Settings {
-            max_landmarks: LANDMARKS,
-            ..estimation::Settings::default()
-        };
-        let mut method = Method::new(rig.clone(), Default::default(), settings)?
-            .watching_rig(&Default::default());
+        let mut extractor = features::extractor(&config.features).ok()?;
+        let (matching, estimation) = (config.matching.clone(), config.estimation.clone());
+        let mut method =
+            Method::new(rig.clone(), matching, estimation)?.watching_rig(&config.rig_watch);
         let material = Material {
             pairs: &self.pairs,
             other_place: &self.other_place,

@@ -170,13 +170,22 @@ pub fn coarse_to_fine(
     let mut best: Option<(Found, f64)> = None;
     let mut at = *start;
     let mut slope = appearance.slant.slope;
+    let mut template = Template::blank();
     for level in (0..=coarsest_level(appearance.size_px)).rev() {
         let px = f64::from(1_u32 << level);
         let reach = match best {
             None => (reach_px / px) as f32,
             Some(_) => FINER_REACH_PX,
         };
-        let Some(found) = on_level(appearance, image, view, (level, reach), &at, slope) else {
+        let Some(found) = on_level(
+            appearance,
+            image,
+            view,
+            &mut template,
+            (level, reach),
+            &at,
+            slope,
+        ) else {
             if best.is_some() {
                 break;
             }
@@ -202,11 +211,13 @@ pub fn coarse_to_fine(
     best.map(|(found, _)| found)
 }
 
-/// Finds a patch on one level, bending it until it fits; the slope itself is left in `gap`.
+/// Finds a patch on one level, bending it until it fits; the slope itself is left in `gap`. `template` is working
+/// memory.
 fn on_level(
     appearance: &Appearance<'_>,
     image: &Pyramid,
     view: &View,
+    template: &mut Template,
     (level, reach): (usize, f32),
     start: &Vector2<f64>,
     mut slope: Vector2<f64>,
@@ -240,7 +251,7 @@ fn on_level(
             depth: (spread.transpose() * depth_by_px).map(|v| v as f32),
         };
         let centre = appearance.px.map(|v| to_level(v, anchor_level) as f32);
-        let template = Template::new(
+        template.fill(
             appearance.image.level(anchor_level),
             &centre,
             &warp,

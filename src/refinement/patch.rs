@@ -118,13 +118,36 @@ impl Template {
         warp: &Warp,
         surface: &Surface,
     ) -> Option<Self> {
-        template(image, centre, warp, surface)
+        let mut template = Self::blank();
+        template.fill(image, centre, warp, surface)?;
+        Some(template)
+    }
+
+    /// One of nothing, to be filled.
+    pub(super) fn blank() -> Self {
+        Self {
+            values: [0.0; ROOM],
+            by: [[0.0; ROOM]; 4],
+            energy: 0.0,
+            normal: Matrix4::zeros(),
+            known: (Matrix4::zeros(), Vector4::zeros()),
+        }
+    }
+
+    /// Makes this one [new](Self::new); `None` where it would not be, which leaves nothing of use.
+    pub(super) fn fill(
+        &mut self,
+        image: &GrayImage,
+        centre: &Vector2<f32>,
+        warp: &Warp,
+        surface: &Surface,
+    ) -> Option<()> {
+        fill(self, image, centre, warp, surface)
     }
 
     #[inline(always)]
-    fn from_samples(wide: &[f32; RIM_ROOM], surface: &Surface) -> Option<Self> {
-        let mut values = [0.0; ROOM];
-        let mut by = [[0.0; ROOM]; 4];
+    fn take(&mut self, wide: &[f32; RIM_ROOM], surface: &Surface) -> Option<()> {
+        let Self { values, by, .. } = self;
         let lever = surface.lever.map(|v| v as f32);
         let spread = surface.spread.map(|v| v as f32);
         let across: [f32; WIDE_SIDE] = std::array::from_fn(|column| column as f32 - HALF as f32);
@@ -148,18 +171,18 @@ impl Template {
                 by_3[i] = along * (spread[(1, 0)] * across[i] + spread[(1, 1)] * y);
             }
         }
-        for samples in by.iter_mut().chain([&mut values]) {
+        for samples in by.iter_mut().chain([&mut *values]) {
             samples[AREA..].fill(0.0);
         }
-        centre_on_zero(&mut values);
-        let energy = dot(&values, &values);
+        centre_on_zero(values);
+        let energy = dot(values, values);
         if energy < MIN_CONTRAST * MIN_CONTRAST * AREA as f32 {
             return None;
         }
-        for derivative in &mut by {
+        for derivative in by.iter_mut() {
             centre_on_zero(derivative);
-            let share = dot(derivative, &values) / energy;
-            for (d, v) in derivative.iter_mut().zip(&values) {
+            let share = dot(derivative, values) / energy;
+            for (d, v) in derivative.iter_mut().zip(&*values) {
                 *d -= share * v;
             }
         }
@@ -179,13 +202,9 @@ impl Template {
         towards
             .fixed_rows_mut::<2>(2)
             .copy_from(&(surface.information * surface.gap));
-        Some(Self {
-            values,
-            by,
-            energy,
-            normal,
-            known: (information, towards),
-        })
+        (self.energy, self.normal) = (energy, normal);
+        self.known = (information, towards);
+        Some(())
     }
 
     /// Finds the template in `image`, starting at `start` and at most `reach` px away from there.
@@ -228,7 +247,13 @@ impl Template {
 }
 
 widened! {
-    fn template = template_in, (image: &GrayImage, centre: &Vector2<f32>, warp: &Warp, surface: &Surface) -> Option<Template>
+    fn fill = fill_in, (
+        template: &mut Template,
+        image: &GrayImage,
+        centre: &Vector2<f32>,
+        warp: &Warp,
+        surface: &Surface,
+    ) -> Option<()>
 }
 
 widened! {
@@ -236,12 +261,13 @@ widened! {
 }
 
 #[inline(always)]
-fn template_in(
+fn fill_in(
+    template: &mut Template,
     image: &GrayImage,
     centre: &Vector2<f32>,
     warp: &Warp,
     surface: &Surface,
-) -> Option<Template> {
+) -> Option<()> {
     let reach = (HALF + 1) as f32;
     let nearest = 1.0 - reach * warp.depth.abs().sum();
     if nearest < 0.5 {
@@ -267,7 +293,7 @@ fn template_in(
             y[column] = centre.y + (linear[(1, 0)] * u + linear[(1, 1)] * v) / nearness;
         }
     }
-    Template::from_samples(&sample(image, &x, &y), surface)
+    template.take(&sample(image, &x, &y), surface)
 }
 
 #[inline(always)]

@@ -72,6 +72,16 @@ fn a_drive_of_kitti_drifts_no_more_without_features_on_the_right() {
     drive_of_kitti(&["--config", config.to_str().unwrap()]);
 }
 
+/// The configuration for computers with little to spare.
+fn lean() -> PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("config/lean.toml")
+}
+
+#[test]
+fn a_drive_of_kitti_drifts_no_more_where_little_is_spent() {
+    drive_of_kitti(&["--config", lean().to_str().unwrap()]);
+}
+
 #[test]
 fn without_features_on_the_right_any_number_of_workers_gives_the_same_bits() {
     let Some(recording) = test_recording("kitti_straight") else {
@@ -105,10 +115,10 @@ fn drive_of_kitti(more: &[&str]) {
     let all = &evaluation["segments"]["all"];
     assert_eq!(all["segments"].as_u64(), Some(128));
     let percent = all["translation_percent"].as_f64().unwrap();
-    // Measured: 0.627 and 0.624 %. Other visual odometries have 0.66 to 1.4 % on these frames.
+    // Measured: 0.627, 0.624 and 0.619 %. Other visual odometries have 0.66 to 1.4 % on these frames.
     assert!(percent < 0.65, "{percent} %");
     let turn = all["rotation_deg_per_m"].as_f64().unwrap();
-    assert!(turn < 0.012, "{turn} °/m"); // measured: 0.0108 both
+    assert!(turn < 0.012, "{turn} °/m"); // measured: 0.0108, 0.0108 and 0.0109
 }
 
 #[test]
@@ -126,7 +136,7 @@ fn a_camera_that_stands_still_stays_where_it_is() {
 
 #[test]
 fn a_rendered_drive_in_full_size_ends_near_the_truth() {
-    // With features on the right, and without.
+    // With features on the right, without, and where little is spent.
     let folder = tempfile::tempdir().unwrap();
     let recording = folder.path().join("drive");
     let output = visod()
@@ -147,8 +157,11 @@ fn a_rendered_drive_in_full_size_ends_near_the_truth() {
     let simulated: Value = serde_json::from_slice(&output.stdout).unwrap();
     let path_m = simulated["length_m"].as_f64().unwrap();
     assert_eq!(simulated["width_px"].as_u64(), Some(1280));
-    let config = surroundings(folder.path(), "");
-    for more in [&[][..], &["--config", config.to_str().unwrap()]] {
+    let configs = [surroundings(folder.path(), ""), lean()];
+    let [surroundings, lean] = configs
+        .each_ref()
+        .map(|config| ["--config", config.to_str().unwrap()]);
+    for more in [&[][..], &surroundings, &lean] {
         let run = replay_quietly(&recording, more);
         assert_tracked(&run.rows, 20);
         let errors_m = errors_m(&run.rows, &true_poses(&recording));

@@ -131,6 +131,7 @@ fn mistakes_are_told_in_a_sentence() {
 /// The short form of `cargo bench --bench corrupted`.
 #[test]
 fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
+    use visod::config::Config;
     use visod::geometry::RigUncertainty;
     use visod::simulation::corruption::Corruption;
     let rig = visod::geometry::StereoRig {
@@ -142,7 +143,9 @@ fn of_corrupted_pairs_no_pose_that_is_called_tracking_is_wrong() {
         }),
         ..visod::simulation::small_rig()
     };
-    let outcome = visod::montecarlo::run_corrupted(&rig, &Corruption::ALL, 2, 1, &|_| {}).unwrap();
+    let outcome =
+        visod::montecarlo::run_corrupted(&rig, &Config::default(), &Corruption::ALL, 2, 1, &|_| {})
+            .unwrap();
     println!("{}", outcome.to_table());
     assert!(outcome.total().corrupted > 500);
     for (kind, tally) in &outcome.kinds {

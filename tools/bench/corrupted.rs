@@ -2,10 +2,13 @@
 //!
 //! Rendered sequences through the whole pipeline, once for every kind of corruption: black, frozen or torn images,
 //! swapped cameras, wrong order, noise and so on. 34 sequences hold more than 10,000 corrupted pairs; the word `rows`
-//! prints every row that is wrong, other words, such as `mover`, name the kinds that are run.
+//! prints every row that is wrong, one that ends in `.toml` names a configuration, others, such as `mover`, the kinds that
+//! are run.
 
 mod common;
 
+use std::path::Path;
+use visod::config::Config;
 use visod::estimation::Odometry;
 use visod::geometry::{RigUncertainty, StereoRig};
 use visod::montecarlo::run_corrupted;
@@ -29,7 +32,11 @@ fn main() {
         kinds.extend(Corruption::ALL);
     }
     let (sequences, seed) = (number(0, SEQUENCES), number(1, 1));
-    let outcome = match run_corrupted(&rig(), &kinds, sequences, seed, &|_| eprint!(".")) {
+    let config = match words.iter().find(|word| word.ends_with(".toml")) {
+        Some(file) => Config::load(Path::new(file)).unwrap_or_else(|e| panic!("{e}")),
+        None => Config::default(),
+    };
+    let outcome = match run_corrupted(&rig(), &config, &kinds, sequences, seed, &|_| eprint!(".")) {
         Ok(outcome) => outcome,
         Err(e) => unreachable!("the rig states its uncertainty: {e}"),
     };

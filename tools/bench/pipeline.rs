@@ -3,20 +3,22 @@
 //! It also shows how the processor's time divides over the stages, and the latency of a steady stream of
 //! 40 pairs a second. With words after `--` it shows something else: `growth`, how the time grows with pixels
 //! and with keypoints; `endurance [PAIRS]`, whether time and memory stay flat over 10,000 pairs;
-//! `paced [HZ]`, the latency at another rate; `profile [PAIRS]`, the
+//! `paced [HZ]`, the latency at another rate; `with FILE…`, whole pairs with other configurations; `profile [PAIRS]`, the
 //! simulated recording once, as a profiler likes it.
 
 mod common;
 
-use common::memory::{Recording, ToAndFro, estimation};
+use common::memory::{Recording, ToAndFro};
 use common::{memory_mb, ms, process_time, thread_time, words};
 use std::convert::Infallible;
 use std::ops::ControlFlow;
+use std::path::Path;
 use std::time::{Duration, Instant};
 use visod::capture::{PairEvent, PairSource, StereoPair};
+use visod::config::Config;
 use visod::features::{self, Extractor};
 use visod::geometry::StereoRig;
-use visod::matching::{self, Partners};
+use visod::matching::Partners;
 use visod::pipeline::{self, Delivery, DescribedPair, Method, StageLatencies};
 use visod::simulation::{small_rig, thesis_rig};
 
@@ -35,49 +37,65 @@ fn main() {
     match words.first().map(String::as_str) {
         Some("growth") => growth(),
         Some("endurance") => endurance(number.unwrap_or(10_000.0) as u64),
+        Some("with") => {
+            let files = words[1..].iter();
+            let cases = files.map(|file| (file.clone(), loaded(Path::new(file)), 2));
+            throughput(&cases.collect::<Vec<_>>());
+        }
         Some("paced") => paced(number.unwrap_or(40.0)),
         Some("profile") => {
             let recording = Recording::simulated(thesis_rig(), FRAMES);
-            let run = Run::of(&recording, number.unwrap_or(300.0) as u64, USUAL, 2);
+            let run = Run::of(&recording, number.unwrap_or(300.0) as u64, &usual(), 2);
             println!("{:.2} ms of processor time a pair", run.cpu_ms);
         }
         _ => {
-            throughput();
+            throughput(&[
+                ("default".to_owned(), usual(), 2),
+                ("default".to_owned(), usual(), 1),
+                ("partners by surroundings".to_owned(), by_surroundings(), 2),
+                ("lean.toml".to_owned(), lean(), 2),
+            ]);
             division();
             paced(40.0);
         }
     }
 }
 
-/// How many keypoints an image has, and what of the right image they are matched with.
-#[derive(Clone, Copy)]
-struct Keypoints {
-    budget: usize,
-    partners: Partners,
+/// The default configuration, but that pairs may come again after the next one, where a recording turns.
+fn usual() -> Config {
+    to_and_fro(Config::default())
 }
 
-/// As many as the targets are for, in both images.
-const USUAL: Keypoints = Keypoints {
-    budget: 1000,
-    partners: Partners::Features,
-};
+/// The same with another number of keypoints an image.
+fn budgeted(budget: usize) -> Config {
+    let mut config = usual();
+    config.features.surf.budget = budget;
+    config
+}
 
-impl Keypoints {
-    fn lean(budget: usize) -> Self {
-        Self {
-            budget,
-            partners: Partners::Surroundings,
-        }
+/// The same, but that no features are found on the right.
+fn by_surroundings() -> Config {
+    let mut config = usual();
+    config.matching.partners = Partners::Surroundings;
+    config
+}
+
+/// What is shipped for computers with little to spare.
+fn lean() -> Config {
+    loaded(&Path::new(env!("CARGO_MANIFEST_DIR")).join("config/lean.toml"))
+}
+
+/// A configuration file's.
+fn loaded(path: &Path) -> Config {
+    match Config::load(path) {
+        Ok(config) => to_and_fro(config),
+        Err(e) => panic!("{e}"),
     }
 }
 
-impl std::fmt::Display for Keypoints {
-    fn fmt(&self, f: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
-        match self.partners {
-            Partners::Features => write!(f, "{}", self.budget),
-            Partners::Surroundings => write!(f, "{} on the left", self.budget),
-        }
-    }
+fn to_and_fro(mut config: Config) -> Config {
+    config.estimation.repeats = 1;
+    config
 }
 
 /// What a run over a recording in memory came to.
@@ -89,27 +107,21 @@ struct Run {
 }
 
 impl Run {
-    fn of(recording: &Recording, pairs: u64, keypoints: Keypoints, workers: usize) -> Self {
+    fn of(recording: &Recording, pairs: u64, config: &Config, workers: usize) -> Self {
         let source = recording.source(WARM_UP + pairs);
-        Self::over(&recording.rig, source, keypoints, workers, |_| ())
+        Self::over(&recording.rig, source, config, workers, |_| ())
     }
 
     /// Carries a whole source through the pipeline; `see` is told of each counted pair.
     fn over(
         rig: &StereoRig,
         source: impl PairSource,
-        Keypoints { budget, partners }: Keypoints,
+        config: &Config,
         workers: usize,
         mut see: impl FnMut(usize),
     ) -> Self {
-        let matching = matching::Settings {
-            partners,
-            ..matching::Settings::default()
-        };
-        let Some(mut method) = Method::new(rig.clone(), matching, estimation()) else {
-            unreachable!("the cameras stand side by side")
-        };
-        let extractors = (0..workers).map(|_| extractor(budget)).collect();
+        let mut method = method(rig, config);
+        let extractors = (0..workers).map(|_| extractor(config)).collect();
         let (mut start, mut start_cpu) = (Instant::now(), process_time());
         let mut rows = 0;
         let mut latencies = Vec::with_capacity(1 << 14);
@@ -141,19 +153,28 @@ impl Run {
     }
 }
 
-fn extractor(budget: usize) -> Box<dyn Extractor> {
-    let mut settings = features::Settings::default();
-    settings.surf.budget = budget;
-    match features::extractor(&settings) {
+fn method(rig: &StereoRig, config: &Config) -> Method {
+    match Method::new(
+        rig.clone(),
+        config.matching.clone(),
+        config.estimation.clone(),
+    ) {
+        Some(method) => method,
+        None => unreachable!("the cameras stand side by side"),
+    }
+}
+
+fn extractor(config: &Config) -> Box<dyn Extractor> {
+    match features::extractor(&config.features) {
         Ok(extractor) => extractor,
         Err(e) => unreachable!("{}: {}", e.key, e.cause),
     }
 }
 
-fn throughput() {
+fn throughput(cases: &[(String, Config, usize)]) {
     println!("\n### Pipeline: whole pairs from memory\n");
     println!(
-        "| recording | keypoints | workers | wall ms a pair | processor ms a pair | features | matching | estimation | estimation's share | resident MB |"
+        "| recording | configuration | workers | wall ms a pair | processor ms a pair | features | matching | estimation | estimation's share | resident MB |"
     );
     println!("|---|---|---:|---:|---:|---:|---:|---:|---:|---:|");
     let simulated = Recording::simulated(thesis_rig(), FRAMES);
@@ -164,14 +185,9 @@ fn throughput() {
             println!("| {name} | skipped: the recording is not there |");
             continue;
         };
-        for (keypoints, workers) in [
-            (USUAL, 2),
-            (USUAL, 1),
-            (Keypoints::lean(1000), 2),
-            (Keypoints::lean(500), 2),
-        ] {
+        for (configuration, config, workers) in cases {
             // The least disturbed of three.
-            let runs = [(); 3].map(|()| Run::of(&recording, PAIRS, keypoints, workers));
+            let runs = [(); 3].map(|()| Run::of(&recording, PAIRS, config, *workers));
             let Some(run) = runs.iter().min_by(|a, b| a.cpu_ms.total_cmp(&b.cpu_ms)) else {
                 continue;
             };
@@ -182,7 +198,7 @@ fn throughput() {
             let median = |stage: fn(&StageLatencies) -> Duration| run.quantile_ms(stage, 0.5);
             let estimation_ms = median(|l| l.estimation);
             println!(
-                "| {name} | {keypoints} | {workers} | {wall_ms:.2} | {:.2} | {:.2} | {:.2} | {estimation_ms:.2} | {:.0} % | {:.0} |",
+                "| {name} | {configuration} | {workers} | {wall_ms:.2} | {:.2} | {:.2} | {:.2} | {estimation_ms:.2} | {:.0} % | {:.0} |",
                 run.cpu_ms,
                 median(|l| l.features),
                 median(|l| l.matching),
@@ -198,13 +214,11 @@ fn throughput() {
 
 /// Where the processor's time goes, pair by pair in one thread.
 fn division() {
+    println!("\n### Division: processor time a pair, one thread, median ms\n");
     println!(
-        "\n### Division: processor time a pair, one thread, 1,000 keypoints an image, median ms\n"
+        "| recording | configuration | features, both images | reductions, both | matching | estimation | all |"
     );
-    println!(
-        "| recording | features, both images | reductions, both | matching | estimation | all |"
-    );
-    println!("|---|---:|---:|---:|---:|---:|");
+    println!("|---|---|---:|---:|---:|---:|---:|");
     let simulated = Recording::simulated(thesis_rig(), FRAMES);
     let kitti = Recording::recorded("kitti_straight", 20);
     for (name, recording) in [("1280 × 960", Some(simulated)), ("KITTI", kitti)] {
@@ -212,28 +226,26 @@ fn division() {
             println!("| {name} | skipped: the recording is not there |");
             continue;
         };
-        let mut times = divided(&recording);
-        let all = (0..times[0].len()).map(|n| times.iter().map(|stage| stage[n]).sum());
-        let mut all: Vec<f64> = all.collect();
-        let median = |times: &mut Vec<f64>| {
-            times.sort_unstable_by(f64::total_cmp);
-            times[times.len() / 2]
-        };
-        let all_ms = median(&mut all);
-        let [features, reductions, matching, estimation] = times.each_mut().map(median);
-        println!(
-            "| {name} | {features:.2} | {reductions:.2} | {matching:.2} | {estimation:.2} | {all_ms:.2} |"
-        );
+        for (configuration, config) in [("default", usual()), ("lean.toml", lean())] {
+            let mut times = divided(&recording, &config);
+            let all = (0..times[0].len()).map(|n| times.iter().map(|stage| stage[n]).sum());
+            let mut all: Vec<f64> = all.collect();
+            let median = |times: &mut Vec<f64>| {
+                times.sort_unstable_by(f64::total_cmp);
+                times[times.len() / 2]
+            };
+            let all_ms = median(&mut all);
+            let [features, reductions, matching, estimation] = times.each_mut().map(median);
+            println!(
+                "| {name} | {configuration} | {features:.2} | {reductions:.2} | {matching:.2} | {estimation:.2} | {all_ms:.2} |"
+            );
+        }
     }
 }
 
 /// What each pair took in features, reductions, matching and estimation, ms.
-fn divided(recording: &Recording) -> [Vec<f64>; 4] {
-    let (matching, estimation) = (Default::default(), estimation());
-    let Some(mut method) = Method::new(recording.rig.clone(), matching, estimation) else {
-        unreachable!("the cameras stand side by side")
-    };
-    let mut extractor = extractor(1000);
+fn divided(recording: &Recording, config: &Config) -> [Vec<f64>; 4] {
+    let (mut method, mut extractor) = (method(&recording.rig, config), extractor(config));
     let mut pair = DescribedPair::default();
     let mut times: [Vec<f64>; 4] = Default::default();
     for place in 0..WARM_UP + PAIRS {
@@ -287,8 +299,8 @@ fn growth() {
         }
     }
     for (name, recording, budget) in cases {
-        let keypoints = Keypoints { budget, ..USUAL };
-        let runs = [(); 3].map(|()| Run::of(&recording, 40, keypoints, 1));
+        let config = budgeted(budget);
+        let runs = [(); 3].map(|()| Run::of(&recording, 40, &config, 1));
         let best = |stage: fn(&StageLatencies) -> Duration| {
             let times = runs.iter().map(|run| run.quantile_ms(stage, 0.1));
             times.fold(f64::INFINITY, f64::min)
@@ -353,7 +365,7 @@ fn endurance(pairs: u64) {
         }
     };
     let source = recording.source(WARM_UP + pairs);
-    Run::over(&recording.rig, source, USUAL, 2, see);
+    Run::over(&recording.rig, source, &usual(), 2, see);
 }
 
 /// Two cameras that show a recording at a rate, whether or not anybody is ready: of two pairs that wait the older
@@ -400,10 +412,8 @@ fn paced(rate_hz: f64) {
     println!("| median ms | p99 ms | slowest ms | pairs a second | lost |");
     println!("|---:|---:|---:|---:|---:|");
     let recording = Recording::simulated(thesis_rig(), FRAMES);
-    let Some(mut method) = Method::new(recording.rig.clone(), Default::default(), estimation())
-    else {
-        unreachable!("the cameras stand side by side")
-    };
+    let config = usual();
+    let mut method = method(&recording.rig, &config);
     let period = Duration::from_secs_f64(1.0 / rate_hz);
     // The threads are there by then.
     let began = Instant::now() + Duration::from_millis(100);
@@ -420,7 +430,7 @@ fn paced(rate_hz: f64) {
         }
         Ok::<_, Infallible>(ControlFlow::Continue(()))
     };
-    let extractors = vec![extractor(1000), extractor(1000)];
+    let extractors = vec![extractor(&config), extractor(&config)];
     let result = pipeline::run(cameras, extractors, &mut method, deliver);
     assert!(result.is_ok());
     latencies.sort_unstable();
