@@ -33,7 +33,7 @@ fn main() {
     }
     let (sequences, seed) = (number(0, SEQUENCES), number(1, 1));
     let config = match words.iter().find(|word| word.ends_with(".toml")) {
-        Some(file) => Config::load(Path::new(file)).unwrap_or_else(|e| panic!("{e}")),
+        Some(file) => common::loaded(Path::new(file)),
         None => Config::default(),
     };
     let outcome = match run_corrupted(&rig(), &config, &kinds, sequences, seed, &|_| eprint!(".")) {

@@ -87,10 +87,7 @@ fn lean() -> Config {
 
 /// A configuration file's.
 fn loaded(path: &Path) -> Config {
-    match Config::load(path) {
-        Ok(config) => to_and_fro(config),
-        Err(e) => panic!("{e}"),
-    }
+    to_and_fro(common::loaded(path))
 }
 
 fn to_and_fro(mut config: Config) -> Config {

@@ -108,3 +108,11 @@ pub fn words() -> Vec<String> {
         .filter(|word| !word.starts_with("--"))
         .collect()
 }
+
+/// A configuration file's settings; what is wrong with it ends the bench.
+pub fn loaded(path: &std::path::Path) -> visod::config::Config {
+    match visod::config::Config::load(path) {
+        Ok(config) => config,
+        Err(e) => unreachable!("only what loads is asked for: {e}"),
+    }
+}
