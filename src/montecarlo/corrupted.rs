@@ -192,12 +192,10 @@ pub fn run_corrupted(
         return Err(MonteCarloError::NoRigUncertainty);
     };
     let mut config = config.clone();
-    let budgets = (
-        &mut config.features.surf.budget,
-        &mut config.estimation.max_landmarks,
-    );
-    *budgets.0 = FEATURES.min(*budgets.0);
-    *budgets.1 = LANDMARKS.min(*budgets.1);
+    let features = &mut config.features.surf.budget;
+    *features = FEATURES.min(*features);
+    let landmarks = &mut config.estimation.max_landmarks;
+    *landmarks = LANDMARKS.min(*landmarks);
     let mut outcome = CorruptedOutcome {
         kinds: kinds.iter().map(|kind| (*kind, Tally::default())).collect(),
         wrong: Vec::new(),
