@@ -82,7 +82,7 @@ impl FrameEstimator for WindowOdometry {
         let agreed = self.inliers.iter().map(|&i| self.known[i as usize]);
         self.agreed.extend(agreed);
         self.window.add(&newest_from_now, &self.agreed);
-        let tracked = self.window.adjust()?;
+        let tracked = self.window.adjust(1.0)?;
         self.window.settle();
         self.window.promote(&self.new);
         self.predicted = tracked.motion.prev_from_now;

@@ -119,6 +119,65 @@ fn on_flat_ground_the_planar_model_keeps_to_the_plane_and_elsewhere_it_says_so()
     }
 }
 
+/// Images whose lower part is still of the pair before show two motions, each of them without a contradiction.
+#[test]
+fn a_pair_of_two_instants_is_not_taken_for_one_of_them() {
+    const LATE: usize = 9;
+    let settings = Settings {
+        frames: 13,
+        ..Settings::default()
+    };
+    let simulation = Simulation::new(
+        SceneName::Hall,
+        TrajectoryName::Slalom,
+        small_rig(),
+        settings,
+    )
+    .expect("a free way");
+    let pairs: Vec<_> = (0..13).map(|frame| simulation.pair(frame)).collect();
+    let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
+    for upper in [0.3, 0.4, 0.5, 0.6, 0.7] {
+        let mut film = Film {
+            rig: small_rig(),
+            pairs: Vec::new(),
+            truth: Vec::new(),
+        };
+        for (i, (pair, truth)) in pairs.iter().enumerate() {
+            let mut pair = pair.clone();
+            if i == LATE {
+                let before = &pairs[i - 1].0;
+                for (now, before) in [
+                    (&mut pair.left, &before.left),
+                    (&mut pair.right, &before.right),
+                ] {
+                    let from = (upper * f64::from(now.height())) as usize * now.width() as usize;
+                    let late = now.pixels_mut()[from..]
+                        .iter_mut()
+                        .zip(&before.pixels()[from..]);
+                    for (grey, before) in late {
+                        // Not the same bytes: those would be found out by themselves.
+                        *grey = before ^ 1;
+                    }
+                }
+            }
+            let mut described = DescribedPair::default();
+            described
+                .describe(extractor.as_mut(), &pair)
+                .expect("features");
+            film.pairs.push(described);
+            film.truth.push(*truth);
+        }
+        let rows = run(&film, &estimation::Settings::default());
+        for (i, row) in rows.iter().enumerate().skip(1) {
+            let is_tracked = row.status == Status::Tracking;
+            assert_eq!(is_tracked, i != LATE, "from {upper} on, pair {i}");
+        }
+        let end = se3::error_fixed_axes(&rows[12].odom_from_camera, &film.truth[12]);
+        let nees = nees(&end, &rows[12].cov_pose).expect("positive definite") / 6.0;
+        assert!(nees < 4.0, "from {upper} on, {nees}");
+    }
+}
+
 /// A right image that is late by a known time is as good as one in time; what its time is uncertain
 /// by stands in the budget.
 #[test]

@@ -47,6 +47,13 @@ const SETTLED_AGREEMENT: f64 = 0.65;
 const MOST_POSTPONED: u32 = 2;
 /// The share of the old landmarks that should be in view that has to be found.
 const QUORUM: f64 = 0.2;
+/// The share of the landmarks in view that are not found where the motion puts them, above which they are sought elsewhere.
+const MANY_MISSING: f64 = 0.2;
+/// The share of those that are found where another instant has them, above which it is one that the images show.
+const MANY_THERE: f64 = 0.3;
+/// The share of the sights in a pair that may prove wrong when the window is adjusted to them. Where more do, the images
+/// show two motions, and what is left may be a mixture of both; else a few in a hundred do.
+const MOST_WRONG: f64 = 0.2;
 /// Sights that may prove wrong before a landmark is given up.
 const MAX_WRONG: u32 = 1;
 
@@ -90,6 +97,8 @@ pub(super) struct Windowed {
     candidates: Vec<usize>,
     /// Whether the newest frame of the window is the present pair.
     holds_present: bool,
+    /// When the present pair was taken.
+    present_ns: i64,
 }
 
 impl Windowed {
@@ -122,12 +131,14 @@ impl Windowed {
             occupancy: Occupancy::default(),
             candidates: Vec::new(),
             holds_present: false,
+            present_ns: 0,
         }
     }
 
     pub(super) fn step(&mut self, bench: &mut Workbench) -> Result<Odometry, MatchError> {
         self.holds_present = false;
         let stamp = bench.now.pair.stamp();
+        let before_ns = std::mem::replace(&mut self.present_ns, stamp.timestamp_ns);
         let Some(mut odometer) = bench.odometer.take() else {
             let mut odometer = bench.new_odometer(stamp);
             let row = odometer.begin(stamp, bench.counts(0));
@@ -140,7 +151,9 @@ impl Windowed {
             bench.odometer = Some(odometer);
             return Err(e);
         }
-        let row = self.track(bench, &mut odometer, &newest_from_now, stamp);
+        let newest_from_before = odometer.predict(before_ns);
+        let expected = [newest_from_before, newest_from_now];
+        let row = self.track(bench, &mut odometer, &expected, stamp);
         bench.odometer = Some(odometer);
         Ok(row)
     }
@@ -163,21 +176,22 @@ impl Windowed {
         })
     }
 
-    /// Adjusts the window to the present pair, or bridges it.
+    /// Adjusts the window to the present pair, or bridges it. `expected` is where the robot should have been at the pair
+    /// before, and where it should be now, seen from the newest frame.
     fn track(
         &mut self,
         bench: &mut Workbench,
         odometer: &mut Odometer,
-        predicted: &Isometry3<f64>,
+        expected: &[Isometry3<f64>; 2],
         stamp: PairStamp,
     ) -> Odometry {
         let consent = self
-            .consent(bench, predicted, stamp.sequence)
+            .consent(bench, &expected[1], stamp.sequence)
             .filter(|motion| odometer.is_possible(motion, stamp.timestamp_ns));
         let tracked = consent.and_then(|newest_from_now| {
             self.find_missed(bench, &newest_from_now);
             bench.matched = Some(Instant::now());
-            if !self.are_seniors_there(bench) {
+            if !self.are_seniors_there(bench) || self.shows_another_instant(bench, expected) {
                 self.gallery.forget_doubts();
                 return None;
             }
@@ -188,7 +202,8 @@ impl Windowed {
             }
             self.window.add(&newest_from_now, &self.seen);
             self.window.expose(&bench.exposure);
-            self.window.adjust()
+            let most_wrong = if self.is_young() { 1.0 } else { MOST_WRONG };
+            self.window.adjust(most_wrong)
         });
         let Some(tracked) = tracked else {
             return self.bridge(bench, odometer, stamp);
@@ -283,15 +298,22 @@ impl Windowed {
     fn predict(&self, bench: &mut Workbench, newest_from_now: &Isometry3<f64>) {
         let now_from_newest = newest_from_now.inverse();
         bench.predicted.clear();
-        bench
-            .predicted
-            .extend(self.gallery.portraits.iter().map(|p| {
-                let landmark = self.window.landmark(p.id)?;
-                let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
-                let px =
-                    estimation::seen_at(&bench.rig, &now_from_anchor, &landmark.inverse_depth)?;
-                Some(self.window.expected_px(&px))
-            }));
+        let portraits = self.gallery.portraits.iter();
+        let expected = portraits.map(|p| self.expected_px(&bench.rig, p, &now_from_newest));
+        bench.predicted.extend(expected);
+    }
+
+    /// Where a landmark should be seen, raw px.
+    fn expected_px(
+        &self,
+        rig: &StereoRig,
+        portrait: &Portrait,
+        now_from_newest: &Isometry3<f64>,
+    ) -> Option<Vector4<f64>> {
+        let landmark = self.window.landmark(portrait.id)?;
+        let now_from_anchor = now_from_newest * self.window.newest_from_anchor(landmark)?;
+        let px = estimation::seen_at(rig, &now_from_anchor, &landmark.inverse_depth)?;
+        Some(self.window.expected_px(&px))
     }
 
     /// Seeks the patch of every recognised landmark near where the detector saw it, and finds the
@@ -354,8 +376,7 @@ impl Windowed {
 
     /// Whether the motion that `agreed` is for is the robot's, as far as the landmarks tell.
     fn is_convincing(&mut self, predicted: &Isometry3<f64>, seed: u64) -> bool {
-        // In a window that is young nothing has stood still for long enough to say which of two it is.
-        self.is_settled = self.tracked_pairs < SENIORITY;
+        self.is_settled = self.is_young();
         if self.is_settled {
             return true;
         }
@@ -367,6 +388,11 @@ impl Windowed {
             0.0
         };
         share >= least && (share >= CLEAR_AGREEMENT || !self.do_others_agree(predicted, seed))
+    }
+
+    /// Whether nothing has stood still in the window for long enough to say which of two motions is the robot's.
+    fn is_young(&self) -> bool {
+        self.tracked_pairs < SENIORITY
     }
 
     /// Whether those that do not agree agree with each other: the images then show two motions.
@@ -526,6 +552,42 @@ impl Windowed {
             }
         }
         f64::from(found) >= QUORUM * f64::from(all)
+    }
+
+    /// Whether landmarks that are not where the motion puts them are where they were in the pair before, or where this
+    /// one was expected to show them: a part of the images is of another instant, and which part is not is a guess.
+    fn shows_another_instant(&self, bench: &Workbench, expected: &[Isometry3<f64>; 2]) -> bool {
+        if self.is_young() {
+            return false;
+        }
+        let in_view = self.gallery.portraits.iter().zip(&bench.predicted);
+        let in_view = in_view.filter_map(|(p, px)| Some((p, px.as_ref()?)));
+        let in_view = in_view.filter(|(_, px)| is_inside(&bench.rig, px));
+        let missing = in_view.clone().filter(|(p, _)| !p.found).count();
+        if (missing as f64) < MANY_MISSING * in_view.count() as f64 {
+            return false;
+        }
+        expected.iter().any(|newest_from_then| {
+            let then_from_newest = newest_from_then.inverse();
+            let (mut there, mut all) = (0, 0);
+            for (i, portrait) in self.gallery.portraits.iter().enumerate() {
+                let then = self.expected_px(&bench.rig, portrait, &then_from_newest);
+                let then = then.filter(|px| !portrait.found && is_inside(&bench.rig, px));
+                // Too near to where it was sought already, it would be of this motion as well.
+                let is_apart = |px: &Vector4<f64>| {
+                    bench.predicted[i].is_none_or(|now| (now - px).amax() >= REACH_PX)
+                };
+                let Some(then) = then.filter(is_apart) else {
+                    continue;
+                };
+                all += 1;
+                there += u32::from(
+                    self.seek(bench, i, &then_from_newest, &then, REACH_PX)
+                        .is_some(),
+                );
+            }
+            there >= bench.estimation.min_inliers && f64::from(there) >= MANY_THERE * f64::from(all)
+        })
     }
 
     /// Where a landmark's patch is in the present pair, near `start`.

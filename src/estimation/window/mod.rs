@@ -119,6 +119,8 @@ pub struct Window {
     memory: Memory,
     kept: State,
     sightings: Sightings,
+    /// Indices of the landmarks whose sights in the newest frame have proved wrong.
+    refuted: Vec<usize>,
     /// Lists of sights that belong to no landmark at present.
     spare_sights: Vec<Vec<Observation>>,
     squares: Vec<f64>,
@@ -187,6 +189,7 @@ impl Window {
             memory: Memory::stocked(),
             kept: State::with_room(frames, landmarks),
             sightings: Sightings::with_room(landmarks),
+            refuted: Vec::with_capacity(landmarks),
             spare_sights,
             squares: Vec::with_capacity(frames * landmarks),
             viewpoints: Viewpoints::with_room(frames),

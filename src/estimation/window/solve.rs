@@ -190,12 +190,17 @@ impl Window {
     }
 
     /// Adjusts the whole window to all sights in it, sights of the newest frame that prove to be
-    /// wrong left out. `None` if the frame is not determined by what is left of it: it is then
-    /// taken out again.
-    pub fn adjust(&mut self) -> Option<Tracked> {
-        let tracked = self.adjust_and_judge();
+    /// wrong left out. `None` if these are more than the share `most_wrong`, or if the frame is not determined by what
+    /// is left of it: it is then taken out again.
+    pub fn adjust(&mut self, most_wrong: f64) -> Option<Tracked> {
+        self.refuted.clear();
+        let tracked = self.adjust_and_judge(most_wrong);
         if tracked.is_none() {
             self.drop_newest();
+            return None;
+        }
+        for &i in &self.refuted {
+            self.landmarks[i].wrong += 1;
         }
         tracked
     }
@@ -227,26 +232,30 @@ impl Window {
         }
     }
 
-    fn adjust_and_judge(&mut self) -> Option<Tracked> {
+    fn adjust_and_judge(&mut self, most_wrong: f64) -> Option<Tracked> {
         self.approach();
         self.judge_newest();
         let mut factor = self.solve()?;
         for _ in 1..ROUNDS {
-            if self.judge_newest() == 0 {
+            if !self.judge_newest() {
                 break;
             }
             self.memory.recycle(factor.unpack_dirty());
             factor = self.solve()?;
         }
+        let (inliers, wrong) = (self.count_newest(), self.refuted.len() as u32);
+        if f64::from(wrong) > most_wrong * f64::from(wrong + inliers) {
+            self.memory.recycle(factor.unpack_dirty());
+            return None;
+        }
         let joint = self.joint_covariance(factor);
-        let tracked = self.conclude(&joint);
+        let tracked = self.conclude(&joint, inliers);
         self.memory.recycle(joint);
         tracked
     }
 
     /// What the adjusted window says of its newest frame; what it says of the rig is kept.
-    fn conclude(&mut self, joint: &Joint) -> Option<Tracked> {
-        let inliers = self.count_newest();
+    fn conclude(&mut self, joint: &Joint, inliers: u32) -> Option<Tracked> {
         if inliers < self.settings.min_inliers {
             return None;
         }
@@ -453,15 +462,15 @@ impl Window {
         }
     }
 
-    /// Takes out the newest frame's sights that lie beyond the gate; how many.
-    fn judge_newest(&mut self) -> usize {
+    /// Takes out the newest frame's sights that lie beyond the gate; whether there are any.
+    fn judge_newest(&mut self) -> bool {
         let limit = self.settings.gate_sigma2 * self.variance.smoothed;
         let Some(newest) = self.newest_serial() else {
-            return 0;
+            return false;
         };
         let mut viewpoints = std::mem::take(&mut self.viewpoints);
         viewpoints.begin(self.frames.len());
-        let mut wrong = 0;
+        let refuted = self.refuted.len();
         for i in 0..self.landmarks.len() {
             let landmark = &self.landmarks[i];
             let Some(last) = landmark.observations.last() else {
@@ -473,12 +482,11 @@ impl Window {
             let judged = self.squared_sigmas(&mut viewpoints, landmark, last);
             if judged.is_none_or(|e| e > limit) {
                 self.landmarks[i].forget(newest);
-                self.landmarks[i].wrong += 1;
-                wrong += 1;
+                self.refuted.push(i);
             }
         }
         self.viewpoints = viewpoints;
-        wrong
+        self.refuted.len() > refuted
     }
 
     /// Squared residual, σ², of one sight of a landmark.

@@ -130,7 +130,7 @@ fn drive_over(
             .expect("agrees");
         let agreed: Vec<Seen> = inliers.iter().map(|&i| known[i as usize]).collect();
         window.add(&newest_from_now, &agreed);
-        let tracked = window.adjust().expect("determined");
+        let tracked = window.adjust(1.0).expect("determined");
         let motion_error = se3::log(&(step().inverse() * tracked.motion.prev_from_now));
         run.nees_motion
             .push(nees(&motion_error, &tracked.motion.cov_right));
@@ -321,7 +321,7 @@ fn a_standing_robot_neither_drifts_nor_grows_its_covariance() {
         simulation.observe(&still, &mut frame);
         let seen = sights(&frame, 0.0, &mut relief);
         window.add(&still, &seen);
-        let tracked = window.adjust().expect("determined");
+        let tracked = window.adjust(1.0).expect("determined");
         window.settle();
         let sigma_m = tracked.cov_pose_right[(2, 2)].sqrt();
         let first = *first_cov.get_or_insert(sigma_m);
@@ -346,13 +346,52 @@ fn what_cannot_be_adjusted_leaves_the_window_as_it_was() {
     window.promote(&[]);
     let before = window.newest_serial();
     window.add(&step(), &[]);
-    assert!(window.adjust().is_none());
+    assert!(window.adjust(1.0).is_none());
     assert_eq!(window.newest_serial(), before);
     assert!(
         window
             .consent(&[], &[], &step(), 1, &mut Vec::new())
             .is_none()
     );
+}
+
+#[test]
+fn a_frame_that_shows_two_motions_is_refused_and_a_few_wrong_sights_are_left_out() {
+    let rig = simulation::thesis_rig();
+    let world = points::Settings {
+        landmarks: 80,
+        ..points::Settings::default()
+    };
+    let mut simulation = points::PointSimulation::new(rig.clone(), world, 5).expect("valid");
+    let mut frame = points::PointFrame::default();
+    let mut relief = Relief::new(0.0, false, 5);
+    simulation.observe(&Isometry3::identity(), &mut frame);
+    let first = sights(&frame, 0.0, &mut relief);
+    simulation.observe(&step(), &mut frame);
+    for (wrong, is_refused) in [(0.1, false), (0.3, true)] {
+        let mut window = Window::new(rig.clone(), exact());
+        let begin = Isometry3::identity();
+        window.begin_at(&begin, &(Matrix6::identity() * 1e-16), &BySources::zeros());
+        window.promote(&first);
+        let before = window.newest_serial();
+        let mut seen = sights(&frame, 0.0, &mut relief);
+        seen.retain(|s| window.landmark(s.id).is_some());
+        let wrong = (wrong * seen.len() as f64) as usize;
+        for s in &mut seen[..wrong] {
+            s.measurement.px += Vector4::new(0.0, 8.0, 0.0, 8.0);
+        }
+        window.add(&step(), &seen);
+        let tracked = window.adjust(0.2);
+        assert_eq!(tracked.is_none(), is_refused, "{wrong} of {}", seen.len());
+        assert_eq!(window.newest_serial() == before, is_refused);
+        // Of a frame that is not believed nobody is to blame.
+        let blamed = seen.iter().filter(|s| {
+            window
+                .landmark(s.id)
+                .is_some_and(|landmark| landmark.wrong > 0)
+        });
+        assert_eq!(blamed.count(), if is_refused { 0 } else { wrong });
+    }
 }
 
 /// Depths, m: all far, all near, all on a plane, a few hundred metres, or the usual.
@@ -405,7 +444,7 @@ fn every_covariance_is_one_under_ten_thousand_configurations() {
             let (known, new): (Vec<Seen>, Vec<Seen>) =
                 seen.iter().partition(|s| window.landmark(s.id).is_some());
             window.add(&step, &known);
-            let Some(tracked) = window.adjust() else {
+            let Some(tracked) = window.adjust(1.0) else {
                 refused += 1;
                 begins = true;
                 continue;
@@ -453,7 +492,7 @@ fn motion_by(points: &[Vector3<f64>]) -> Tracked {
     };
     window.promote(&seen_after(&Isometry3::identity()));
     window.add(&step(), &seen_after(&step()));
-    window.adjust().expect("determined")
+    window.adjust(1.0).expect("determined")
 }
 
 /// A hundred points, spread over what the cameras see from 0 to 1 across and down, at these depths.
