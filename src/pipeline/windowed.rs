@@ -556,35 +556,38 @@ impl Windowed {
 
     /// Whether landmarks that are not where the motion puts them are where they were in the pair before, or where this
     /// one was expected to show them: a part of the images is of another instant, and which part is not is a guess.
+    /// Those that no motion has found again as yet have no say: they may belong to a body that goes along with the camera.
     fn shows_another_instant(&self, bench: &Workbench, expected: &[Isometry3<f64>; 2]) -> bool {
         if self.is_young() {
             return false;
         }
-        let in_view = self.gallery.portraits.iter().zip(&bench.predicted);
-        let in_view = in_view.filter_map(|(p, px)| Some((p, px.as_ref()?)));
-        let in_view = in_view.filter(|(_, px)| is_inside(&bench.rig, px));
-        let missing = in_view.clone().filter(|(p, _)| !p.found).count();
-        if (missing as f64) < MANY_MISSING * in_view.count() as f64 {
+        let known = self.gallery.portraits.iter().zip(&bench.predicted);
+        let known = known.enumerate().filter(|(_, (p, _))| p.age > 0);
+        let is_in_view = |px: &Vector4<f64>| is_inside(&bench.rig, px);
+        let (mut missing, mut all) = (0, 0);
+        for (_, (portrait, now)) in known.clone() {
+            if now.is_some_and(|now| is_in_view(&now)) {
+                all += 1;
+                missing += u32::from(!portrait.found);
+            }
+        }
+        if f64::from(missing) < MANY_MISSING * f64::from(all) {
             return false;
         }
         expected.iter().any(|newest_from_then| {
             let then_from_newest = newest_from_then.inverse();
             let (mut there, mut all) = (0, 0);
-            for (i, portrait) in self.gallery.portraits.iter().enumerate() {
-                let then = self.expected_px(&bench.rig, portrait, &then_from_newest);
-                let then = then.filter(|px| !portrait.found && is_inside(&bench.rig, px));
+            for (i, (portrait, now)) in known.clone().filter(|(_, (p, _))| !p.found) {
                 // Too near to where it was sought already, it would be of this motion as well.
-                let is_apart = |px: &Vector4<f64>| {
-                    bench.predicted[i].is_none_or(|now| (now - px).amax() >= REACH_PX)
-                };
-                let Some(then) = then.filter(is_apart) else {
+                let is_apart =
+                    |px: &Vector4<f64>| now.is_none_or(|now| (now - px).amax() >= REACH_PX);
+                let then = self.expected_px(&bench.rig, portrait, &then_from_newest);
+                let Some(then) = then.filter(|px| is_in_view(px) && is_apart(px)) else {
                     continue;
                 };
+                let found = self.seek(bench, i, &then_from_newest, &then, REACH_PX);
                 all += 1;
-                there += u32::from(
-                    self.seek(bench, i, &then_from_newest, &then, REACH_PX)
-                        .is_some(),
-                );
+                there += u32::from(found.is_some());
             }
             there >= bench.estimation.min_inliers && f64::from(there) >= MANY_THERE * f64::from(all)
         })
