@@ -1,7 +1,7 @@
 //! Every estimator and model through the whole method, on rendered pairs.
 
 use super::{DescribedPair, Method};
-use crate::capture::Skew;
+use crate::capture::{Side, Skew, StereoPair};
 use crate::estimation::{self, MotionModel, Odometry, Status};
 use crate::features;
 use crate::geometry::{StereoRig, se3};
@@ -16,30 +16,38 @@ struct Film {
     truth: Vec<Isometry3<f64>>,
 }
 
+impl Film {
+    fn of(pairs: impl Iterator<Item = (StereoPair, Isometry3<f64>)>) -> Self {
+        let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
+        let mut film = Self {
+            rig: small_rig(),
+            pairs: Vec::new(),
+            truth: Vec::new(),
+        };
+        for (pair, truth) in pairs {
+            let mut described = DescribedPair::default();
+            described
+                .describe(extractor.as_mut(), &pair)
+                .expect("features");
+            film.pairs.push(described);
+            film.truth.push(truth);
+        }
+        film
+    }
+}
+
+fn in_the_hall(trajectory: TrajectoryName, settings: Settings) -> Simulation {
+    Simulation::new(SceneName::Hall, trajectory, small_rig(), settings).expect("a free way")
+}
+
 fn film(trajectory: TrajectoryName, frames: u64, shake: f64) -> Film {
     let settings = Settings {
         frames,
         shake,
         ..Settings::default()
     };
-    let simulation =
-        Simulation::new(SceneName::Hall, trajectory, small_rig(), settings).expect("a free way");
-    let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
-    let mut film = Film {
-        rig: small_rig(),
-        pairs: Vec::new(),
-        truth: Vec::new(),
-    };
-    for frame in 0..frames {
-        let (pair, truth) = simulation.pair(frame);
-        let mut described = DescribedPair::default();
-        described
-            .describe(extractor.as_mut(), &pair)
-            .expect("features");
-        film.pairs.push(described);
-        film.truth.push(truth);
-    }
-    film
+    let simulation = in_the_hall(trajectory, settings);
+    Film::of((0..frames).map(|frame| simulation.pair(frame)))
 }
 
 fn run(film: &Film, settings: &estimation::Settings) -> Vec<Odometry> {
@@ -127,46 +135,24 @@ fn a_pair_of_two_instants_is_not_taken_for_one_of_them() {
         frames: 13,
         ..Settings::default()
     };
-    let simulation = Simulation::new(
-        SceneName::Hall,
-        TrajectoryName::Slalom,
-        small_rig(),
-        settings,
-    )
-    .expect("a free way");
+    let simulation = in_the_hall(TrajectoryName::Slalom, settings);
     let pairs: Vec<_> = (0..13).map(|frame| simulation.pair(frame)).collect();
-    let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
     for upper in [0.3, 0.4, 0.5, 0.6, 0.7] {
-        let mut film = Film {
-            rig: small_rig(),
-            pairs: Vec::new(),
-            truth: Vec::new(),
-        };
-        for (i, (pair, truth)) in pairs.iter().enumerate() {
-            let mut pair = pair.clone();
-            if i == LATE {
-                let before = &pairs[i - 1].0;
-                for (now, before) in [
-                    (&mut pair.left, &before.left),
-                    (&mut pair.right, &before.right),
-                ] {
-                    let from = (upper * f64::from(now.height())) as usize * now.width() as usize;
-                    let late = now.pixels_mut()[from..]
-                        .iter_mut()
-                        .zip(&before.pixels()[from..]);
-                    for (grey, before) in late {
-                        // Not the same bytes: those would be found out by themselves.
-                        *grey = before ^ 1;
-                    }
-                }
+        let mut pairs_seen = pairs.clone();
+        let before = &pairs[LATE - 1].0;
+        let late = &mut pairs_seen[LATE].0;
+        for (now, before) in [
+            (&mut late.left, &before.left),
+            (&mut late.right, &before.right),
+        ] {
+            let from = (upper * f64::from(now.height())) as usize * now.width() as usize;
+            let below = now.pixels_mut()[from..].iter_mut();
+            for (grey, before) in below.zip(&before.pixels()[from..]) {
+                // Not the same bytes: those would be found out by themselves.
+                *grey = before ^ 1;
             }
-            let mut described = DescribedPair::default();
-            described
-                .describe(extractor.as_mut(), &pair)
-                .expect("features");
-            film.pairs.push(described);
-            film.truth.push(*truth);
         }
+        let film = Film::of(pairs_seen.into_iter());
         let rows = run(&film, &estimation::Settings::default());
         for (i, row) in rows.iter().enumerate().skip(1) {
             let is_tracked = row.status == Status::Tracking;
@@ -192,37 +178,19 @@ fn a_known_skew_is_compensated_and_its_uncertainty_stands_in_the_budget() {
             speed_m_s: Some(1.5),
             ..Settings::default()
         };
-        let simulation = Simulation::new(
-            SceneName::Hall,
-            TrajectoryName::Circle,
-            small_rig(),
-            settings,
-        )
-        .expect("a free way");
-        let mut extractor = features::extractor(&features::Settings::default()).expect("valid");
-        let mut film = Film {
-            rig: small_rig(),
-            pairs: Vec::new(),
-            truth: Vec::new(),
-        };
-        for i in 0..8_u64 {
+        let simulation = in_the_hall(TrajectoryName::Circle, settings);
+        Film::of((0..8_u64).map(|i| {
             let left = 25 * i;
             let late = left + u64::from(skew_ns > 0);
             let (mut pair, truth) = simulation.pair(left);
-            pair.right = simulation.image(late, crate::capture::Side::Right);
+            pair.right = simulation.image(late, Side::Right);
             pair.sequence = i;
             pair.skew = Skew {
                 ns: skew_ns,
                 sigma_ns: 100_000.0,
             };
-            let mut described = DescribedPair::default();
-            described
-                .describe(extractor.as_mut(), &pair)
-                .expect("features");
-            film.pairs.push(described);
-            film.truth.push(truth);
-        }
-        film
+            (pair, truth)
+        }))
     };
     let late = film_at(SKEW_NS);
     for method in [estimation::Method::Window, estimation::Method::Bundle] {

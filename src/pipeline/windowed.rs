@@ -543,15 +543,20 @@ impl Windowed {
     /// Whether old landmarks were found where the motion puts them, if there should be some: where something new hides
     /// the world or outshines it, they are not.
     fn are_seniors_there(&self, bench: &Workbench) -> bool {
-        let expected = self.gallery.portraits.iter().zip(&bench.predicted);
-        let (mut found, mut all) = (0_u32, 0_u32);
-        for (portrait, px) in expected {
-            if portrait.age >= SENIORITY && px.is_some_and(|px| is_inside(&bench.rig, &px)) {
+        let (found, all) = self.found_in_view(bench, SENIORITY);
+        f64::from(found) >= QUORUM * f64::from(all)
+    }
+
+    /// How many of the landmarks that were found so often before are found, and how many should be in view.
+    fn found_in_view(&self, bench: &Workbench, least_age: u32) -> (u32, u32) {
+        let (mut found, mut all) = (0, 0);
+        for (portrait, px) in self.gallery.portraits.iter().zip(&bench.predicted) {
+            if portrait.age >= least_age && px.is_some_and(|px| is_inside(&bench.rig, &px)) {
                 all += 1;
                 found += u32::from(portrait.found);
             }
         }
-        f64::from(found) >= QUORUM * f64::from(all)
+        (found, all)
     }
 
     /// Whether landmarks that are not where the motion puts them are where they were in the pair before, or where this
@@ -561,28 +566,23 @@ impl Windowed {
         if self.is_young() {
             return false;
         }
-        let known = self.gallery.portraits.iter().zip(&bench.predicted);
-        let known = known.enumerate().filter(|(_, (p, _))| p.age > 0);
-        let is_in_view = |px: &Vector4<f64>| is_inside(&bench.rig, px);
-        let (mut missing, mut all) = (0, 0);
-        for (_, (portrait, now)) in known.clone() {
-            if now.is_some_and(|now| is_in_view(&now)) {
-                all += 1;
-                missing += u32::from(!portrait.found);
-            }
-        }
-        if f64::from(missing) < MANY_MISSING * f64::from(all) {
+        let (found, all) = self.found_in_view(bench, 1);
+        if f64::from(all - found) < MANY_MISSING * f64::from(all) {
             return false;
         }
+        let known = self.gallery.portraits.iter().zip(&bench.predicted);
+        let missing = known
+            .enumerate()
+            .filter(|(_, (p, _))| p.age >= 1 && !p.found);
         expected.iter().any(|newest_from_then| {
             let then_from_newest = newest_from_then.inverse();
             let (mut there, mut all) = (0, 0);
-            for (i, (portrait, now)) in known.clone().filter(|(_, (p, _))| !p.found) {
+            for (i, (portrait, now)) in missing.clone() {
                 // Too near to where it was sought already, it would be of this motion as well.
                 let is_apart =
                     |px: &Vector4<f64>| now.is_none_or(|now| (now - px).amax() >= REACH_PX);
                 let then = self.expected_px(&bench.rig, portrait, &then_from_newest);
-                let Some(then) = then.filter(|px| is_in_view(px) && is_apart(px)) else {
+                let Some(then) = then.filter(|px| is_inside(&bench.rig, px) && is_apart(px)) else {
                     continue;
                 };
                 let found = self.seek(bench, i, &then_from_newest, &then, REACH_PX);

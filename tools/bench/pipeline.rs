@@ -8,7 +8,7 @@
 
 mod common;
 
-use common::memory::{Recording, ToAndFro};
+use common::memory::{Recording, ToAndFro, with_turns};
 use common::{memory_mb, ms, process_time, thread_time, words};
 use std::convert::Infallible;
 use std::ops::ControlFlow;
@@ -61,9 +61,9 @@ fn main() {
     }
 }
 
-/// The default configuration, but that pairs may come again after the next one, where a recording turns.
+/// The default configuration, for a recording that turns.
 fn usual() -> Config {
-    to_and_fro(Config::default())
+    turning(Config::default())
 }
 
 /// The same with another number of keypoints an image.
@@ -87,11 +87,11 @@ fn lean() -> Config {
 
 /// A configuration file's.
 fn loaded(path: &Path) -> Config {
-    to_and_fro(common::loaded(path))
+    turning(common::loaded(path))
 }
 
-fn to_and_fro(mut config: Config) -> Config {
-    config.estimation.repeats = 1;
+fn turning(mut config: Config) -> Config {
+    config.estimation = with_turns(config.estimation);
     config
 }
 

@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 use std::sync::Arc;
 use visod::capture::{Dataset, PairEvent, PairSource, ReadAhead, StereoPair};
+use visod::estimation;
 use visod::geometry::StereoRig;
 use visod::simulation::{SceneName, Settings, Simulation, TrajectoryName};
 
@@ -68,11 +69,16 @@ impl Recording {
     }
 }
 
-/// The estimator's defaults, but that pairs may come again after the next one, where a source turns.
-pub fn estimation() -> visod::estimation::Settings {
-    visod::estimation::Settings {
+/// The estimator's defaults, for a source that [turns](with_turns).
+pub fn estimation() -> estimation::Settings {
+    with_turns(estimation::Settings::default())
+}
+
+/// The same settings, but that pairs may come again after the next one, where a source turns.
+pub fn with_turns(settings: estimation::Settings) -> estimation::Settings {
+    estimation::Settings {
         repeats: 1,
-        ..Default::default()
+        ..settings
     }
 }
 
